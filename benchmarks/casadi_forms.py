@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from benchmarks.vehicle import Row
-from switchfit.discretization.rows import EXPLICIT
+from switchfit.discretization.tableaus import EXPLICIT
 
 D = 3
 Symbol = ca.SX | ca.MX

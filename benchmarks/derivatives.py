@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks import vehicle
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
-from switchfit.engine.native.engine import native_experiment
-from switchfit.engine.native.templates import Order
+from switchfit.engine.native.native_experiment import native_experiment
+from switchfit.engine.native.sizes import Order
 from switchfit.fit.evaluator import Evaluator
 
 COARSE = 58

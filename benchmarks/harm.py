@@ -21,7 +21,7 @@ from typing import Any
 import switchfit as sf
 from benchmarks.report import RESULTS, format_table
 from benchmarks.starts.problems import PROBLEMS, build_case
-from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.loading import load_problem
 from switchfit.io.user_files import load_object
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

@@ -13,7 +13,7 @@ import numpy as np
 import switchfit as sf
 from benchmarks.report import Report
 from benchmarks.timing import ms
-from switchfit.engine.native.program import _program_of
+from switchfit.engine.native.program_cache import _program_of
 from switchfit.fit import solution
 from switchfit.fit.evaluator import Evaluator
 

@@ -24,7 +24,7 @@ from benchmarks.peers import Functions
 from benchmarks.problems import Case
 from benchmarks.report import Report
 from benchmarks.timing import ms, turns_within
-from switchfit.engine.native.program import drop_programs
+from switchfit.engine.native.program_cache import drop_programs
 from switchfit.fit.evaluator import Evaluator
 
 QUANTITIES = ("cost", "gradient", "hessian")

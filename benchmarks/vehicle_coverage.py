@@ -18,16 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import switchfit as sf
-from switchfit.models import (
-    bicycle,
-    differential_drive,
-    lugre,
-    magic_formula,
-    rolling_body,
-    skid_steer,
-    sliding_block,
-)
-from switchfit.models.magic_formula import MAGIC_FORMULA
+from switchfit.models import bicycle, differential_drive, lugre, magic_formula, rolling_body, skid_steer, sliding_block
+from switchfit.models.tyre_forces import MAGIC_FORMULA
 
 RUNS = 200
 FEW = 40

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import switchfit as sf
-from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.loading import load_problem
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "covid" / "search.toml"
 

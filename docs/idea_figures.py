@@ -17,7 +17,7 @@ matplotlib.use("agg")
 
 from matplotlib.figure import Figure
 
-from switchfit.report.plot import plot_comparison, plot_modes, plot_transitions
+from switchfit.report.panels import plot_comparison, plot_modes, plot_transitions
 from switchfit.uncertainty.residuals import find_transition_intervals
 
 HERE = Path(__file__).parent

@@ -13,15 +13,15 @@ from matplotlib.figure import Figure
 
 import switchfit as sf
 from switchfit.models import bicycle, differential_drive, lugre, rolling_body, skid_steer
-from switchfit.models.magic_formula import (
+from switchfit.models.tyre_forces import (
     ALIGNING_MOMENT,
     MAGIC_FORMULA,
     compute_aligning_moment,
     lateral_force,
     longitudinal_force,
 )
-from switchfit.report.plot import plot_modes
-from switchfit.report.style import FIT, LINE_COLOURS, REFERENCE
+from switchfit.report.panels import plot_modes
+from switchfit.report.style import FIT_COLOUR, LINE_COLOURS, REFERENCE_COLOUR
 
 NOTHING = sf.RunningCost(lambda t, x, p: x @ x)
 SIZE = (6.4, 3.2)
@@ -75,7 +75,7 @@ def draw_path(ax: Axes, path: sf.Trajectory, places: tuple[int, int, int], size:
         k = int(np.searchsorted(path.times, t))
         cos, sin = np.cos(heading[k]), np.sin(heading[k])
         outline = corners @ np.array([[cos, sin], [-sin, cos]]) + [X[k], Y[k]]
-        ax.plot(outline[:, 0], outline[:, 1], color=REFERENCE, linewidth=0.8, zorder=1)
+        ax.plot(outline[:, 0], outline[:, 1], color=REFERENCE_COLOUR, linewidth=0.8, zorder=1)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel("X (m)")
     ax.set_ylabel("Y (m)")
@@ -91,7 +91,7 @@ def draw_skid_steer(figure: Figure) -> None:
     _, dX, _, dY, theta, turn = path.states.T
     across = -np.sin(theta) * dX + np.cos(theta) * dY
     plot_modes(path, right)
-    right.plot(path.times, across + 0.25 * turn, color=FIT, linewidth=2, label="front axle")
+    right.plot(path.times, across + 0.25 * turn, color=FIT_COLOUR, linewidth=2, label="front axle")
     right.plot(path.times, across - 0.25 * turn, color="black", linewidth=1.2, linestyle="--", label="rear axle")
     right.set_ylabel("lateral speed (m/s)")
     right.legend(frameon=False, fontsize=8, loc="lower left")
@@ -123,7 +123,7 @@ def draw_bicycle(figure: Figure) -> None:
     draw_path(left, path, (0, 1, 2), (3.6, 1.7))
     plot_modes(path, right)
     drift = np.degrees(np.arctan2(path.states[:, 4], path.states[:, 3]))
-    right.plot(path.times, drift, color=FIT, linewidth=2)
+    right.plot(path.times, drift, color=FIT_COLOUR, linewidth=2)
     right.set_ylabel("drift angle (degrees)")
 
 
@@ -134,7 +134,7 @@ def draw_rolling_body(figure: Figure) -> None:
     path = simulate(rolling_body(radius=0.11), ("skid", "roll"), (when,), 2.0, p)
     ax = figure.subplots()
     plot_modes(path, ax)
-    ax.plot(path.times, path.states[:, 1], color=FIT, linewidth=2, label="v, of the center")
+    ax.plot(path.times, path.states[:, 1], color=FIT_COLOUR, linewidth=2, label="v, of the center")
     ax.plot(path.times, 0.11 * path.states[:, 2], color="black", linewidth=1.2, linestyle="--", label="R ω")
     ax.set_ylabel("speed (m/s)")
     ax.legend(frameon=False, fontsize=8)
@@ -146,8 +146,8 @@ def draw_lugre(figure: Figure) -> None:
     pulled = sf.Input([0.0, 20.0], [0.0, 2.0], kind="linear")
     path = simulate(lugre(k=2.0), ("forward",), (), 20.0, p, inputs=pulled, solver="stiff")
     ax = figure.subplots()
-    ax.plot(path.times, path.states[:, 0], color=FIT, linewidth=2, label="body")
-    ax.plot([0.0, 20.0], [0.0, 2.0], color=REFERENCE, linewidth=1, label="end of the spring")
+    ax.plot(path.times, path.states[:, 0], color=FIT_COLOUR, linewidth=2, label="body")
+    ax.plot([0.0, 20.0], [0.0, 2.0], color=REFERENCE_COLOUR, linewidth=1, label="end of the spring")
     ax.set_xlabel("t (s)")
     ax.set_ylabel("position (m)")
     ax.legend(frameon=False, fontsize=8)

@@ -12,8 +12,9 @@ from hypothesis import settings
 
 import switchfit as sf
 from switchfit.batch import program as batch_program
-from switchfit.engine.native import llvm, program
-from switchfit.engine.native.program import drop_programs
+from switchfit.engine.native import program_cache
+from switchfit.engine.native.llvm import compilation
+from switchfit.engine.native.program_cache import drop_programs
 from switchfit.models import heater_problem
 from switchfit.uncertainty import certificate
 
@@ -51,7 +52,7 @@ jax.jit(lambda: 0)()
 os.environ["XLA_FLAGS"] = DEFAULT_FLAGS
 
 
-AS_USERS = llvmlite.binding.Target.create_target_machine, llvm.compile_modules
+AS_USERS = llvmlite.binding.Target.create_target_machine, compilation.compile_modules
 
 
 def pytest_configure(config):
@@ -70,7 +71,7 @@ def pytest_configure(config):
         return compile_modules(f"{text}\n; without optimisation\n" for text in texts)
 
     llvmlite.binding.Target.create_target_machine = create_quickly
-    llvm.compile_modules = program.compile_modules = compile_quickly
+    compilation.compile_modules = program_cache.compile_modules = compile_quickly
 
 
 TOGETHER = ("test_adjoint", "test_native", "test_prediction")
@@ -112,7 +113,7 @@ def optimised_machine_code():
     drop_programs()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(llvmlite.binding.Target, "create_target_machine", AS_USERS[0])
-        for module in (llvm, program):
+        for module in (compilation, program_cache):
             patch.setattr(module, "compile_modules", AS_USERS[1])
         yield
     drop_programs()

@@ -18,18 +18,8 @@ import drawn
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "switchfit"
 
-PAPER, ROWS = "paper_adjoint.py", "discretization/rows.py"
-MODEL, PROPAGATION = "discretization/model.py", "discretization/propagation.py"
-STRUCTURE, CORNERS, EVALUATOR = "problem/structure.py", "problem/corners.py", "fit/evaluator.py"
-ALGEBRA, QP, STATE, STEP = (f"optimize/{name}.py" for name in ("algebra", "qp", "state", "step"))
-PROGRAMS, COURSE, SPLIT = "engine/jax.py", "engine/branches.py", "engine/choice.py"
-HYPOTHESES = "engine/native/hypotheses.py"
-KERNELS, SEGMENTS, TEMPLATES, ELIMINATION, ROUTINES = (
-    f"engine/native/{name}.py" for name in ("kernels", "program", "templates", "arrays", "llvm")
-)
-CHOICE, HOPS = "strategy/choice.py", "strategy/hops.py"
-BEAM, FITTER, MODE_POOL = "strategy/beam.py", "modes/fitter.py", "modes/hunt.py"
-ONLINE, TRACKER, CRITERION = "online/estimator.py", "online/tracker.py", "experiment_design.py"
+PAPER, DESIGN, OPTIMIZE, ROWS = "paper_adjoint.py", "experiment_design", "optimize", "discretization"
+JAX, NATIVE, CORNERS, SPLIT = "engine/jax", "engine/native", "problem/corners", "engine/corners"
 
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
 PROTOCOL = ["tests/test_protocol.py"]
@@ -68,12 +58,12 @@ SELECTIONS = TESTS | {
 
 
 Mistake = tuple[str, list[tuple[str, str]]]
-"""A file, and texts with what replaces them."""
+"""A room or a file, and texts with what replaces them."""
 
 
-def swap(path: str, *texts: str) -> Mistake:
-    """Return the mistake in a file that replaces the first text by the second, the third by the fourth, and so on."""
-    return path, list(zip(texts[::2], texts[1::2], strict=True))
+def swap(where: str, *texts: str) -> Mistake:
+    """Return the mistake in a room that replaces the first text by the second, the third by the fourth, and so on."""
+    return where, list(zip(texts[::2], texts[1::2], strict=True))
 
 
 BY_HAND: dict[str, dict[str, Mistake]] = {
@@ -114,34 +104,36 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             ROWS, "((psi * slopes[j]).sum() + densities[j])", "(psi * slopes[j]).sum()"
         ),
         "mu in what the length multiplies": swap(
-            ROWS, "(mu[j] * combine(tableau.a[j], slopes)).sum()", "0.0 * combine(tableau.a[j], slopes).sum()"
+            ROWS,
+            "(mu[j] * combine(tableau.a[j], slopes)).sum()",
+            "0.0 * combine(tableau.a[j], slopes).sum()",
         ),
         "times of the stages": swap(ROWS, "[start_d + c * h_d for c", "[end_d - c * h_d for c"),
     },
     "native": {
         "the time of a transition in a node": swap(
-            KERNELS, 'g = g + g_t.item() * graph.load("moves", 0, vector=True)', "g = g + 0.0"
+            NATIVE, 'g = g + g_t.item() * graph.load("moves", 0, vector=True)', "g = g + 0.0"
         ),
         "functions of another stage of a row": swap(
-            KERNELS, 'graph.load("kept", j * len(kept) + k, certain', 'graph.load("kept", k, certain'
+            NATIVE, 'graph.load("kept", j * len(kept) + k, certain', 'graph.load("kept", k, certain'
         ),
         "half of the mixed entries in Z' S Z": swap(
-            KERNELS, "for one, other in {(k, m), (m, k)}:", "for one, other in {(k, m)}:"
+            NATIVE, "for one, other in {(k, m), (m, k)}:", "for one, other in {(k, m)}:"
         ),
         "the length of a row in the Hessian": swap(
-            KERNELS, '+ graph.load("length", d) * (end_d - start_d)', "+ 0.0 * (end_d - start_d)"
+            NATIVE, '+ graph.load("length", d) * (end_d - start_d)', "+ 0.0 * (end_d - start_d)"
         ),
-        "the sample behind a transition": swap(SEGMENTS, "(cell >= begin)", "(cell > begin)"),
-        "W in the Gauss-Newton matrix": swap(TEMPLATES, "hb * apply_weights(W, A)", "hb * A"),
+        "the sample behind a transition": swap(NATIVE, "(cell >= begin)", "(cell > begin)"),
+        "W in the Gauss-Newton matrix": swap(NATIVE, "hb * apply_weights(W, A)", "hb * A"),
     },
     "jax": {
         "weights of the stages": swap(
-            PROPAGATION, "[model.mode_of_segment][layout.segment]", "[model.mode_of_segment][layout.segment, ::-1]"
+            ROWS, "[model.mode_of_segment][layout.segment]", "[model.mode_of_segment][layout.segment, ::-1]"
         ),
-        "samples at t0 in the costates": swap(PROGRAMS, "jnp.where(s.cell[:, None] < 0, 0.0, s.weight)", "s.weight"),
-        "the Fisher information of sigma": swap(PROGRAMS, "H + 2.0 * jnp", "H + 1.0 * jnp"),
-        "rho' in the Gauss-Newton matrix": swap(PROGRAMS, "r_d, weight, r_d", "r_d, jnp.sign(weight), r_d"),
-        "W in the Gauss-Newton matrix": swap(PROGRAMS, "jax.vmap(partial(apply_weights, W))(at_stages)", "at_stages"),
+        "samples at t0 in the costates": swap(JAX, "jnp.where(s.cell[:, None] < 0, 0.0, s.weight)", "s.weight"),
+        "the Fisher information of sigma": swap(JAX, "H + 2.0 * jnp", "H + 1.0 * jnp"),
+        "rho' in the Gauss-Newton matrix": swap(JAX, "r_d, weight, r_d", "r_d, jnp.sign(weight), r_d"),
+        "W in the Gauss-Newton matrix": swap(JAX, "jax.vmap(partial(apply_weights, W))(at_stages)", "at_stages"),
     },
     "implicit": {
         "D_1 f x' in the tangents": swap(ROWS, "[given + times_vector(J, X_d) for", "[given for"),
@@ -152,68 +144,68 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             ROWS, "DAMPING * (h * slope + combine(STIFF_ERROR, k))", "DAMPING * combine(STIFF_ERROR, k)"
         ),
         "the factors of the last row": swap(
-            SEGMENTS, '"x", "Z", *OF_STAGES)', '"x", "Z", "X", "XZ") | writer.at_row(found, 0, "kept")'
+            NATIVE, '"x", "Z", *OF_STAGES)', '"x", "Z", "X", "XZ") | writer.at_row(found, 0, "kept")'
         ),
         "no second derivative of Newton's map": swap(
-            KERNELS,
+            NATIVE,
             "second[j] = list_entries(S, with_time=moving)",
             "second[j] = list_entries(S * (not tableau.coupled), with_time=moving)",
         ),
-        "the order of the states": swap(ELIMINATION, "x[np.argsort(self._order)]", "x"),
-        "pivots of a routine": swap(ROUTINES, "is_larger.choose(row,", "is_larger.choose(k,"),
-        "a row that does not converge": swap(SEGMENTS, 'store(float("nan"),', "store(0.0,"),
-        "rounding errors of a state": swap(KERNELS, "CHANGE = 1e-10, 1e-12", "CHANGE = 1e-10, 0.0"),
-        "slopes of a row that moves": swap(KERNELS, "(found.slopes if moving else [])", "([] if moving else [])"),
+        "the order of the states": swap(NATIVE, "x[np.argsort(self._order)]", "x"),
+        "pivots of a routine": swap(NATIVE, "is_larger.choose(row,", "is_larger.choose(k,"),
+        "a row that does not converge": swap(NATIVE, 'store(float("nan"),', "store(0.0,"),
+        "rounding errors of a state": swap(NATIVE, "CHANGE = 1e-10, 1e-12", "CHANGE = 1e-10, 0.0"),
+        "slopes of a row that moves": swap(NATIVE, "(found.slopes if moving else [])", "([] if moving else [])"),
         "the length of a row in the Hessian": swap(
-            KERNELS, 'K_d.append(graph.loads("XZ", n, (count + j) * n, vector=True))', "K_d.append(X_d)"
+            NATIVE, 'K_d.append(graph.loads("XZ", n, (count + j) * n, vector=True))', "K_d.append(X_d)"
         ),
     },
     "sqp": {
         "absolute values of eigenvalues": swap(
-            ALGEBRA,
+            OPTIMIZE,
             "replaced = xp.maximum(xp.abs(values), EIGENVALUE_REPLACEMENT)",
             "replaced = xp.maximum(values, 1e-3)",
         ),
         "the decrease that a step must achieve": swap(
-            ALGEBRA,
+            OPTIMIZE,
             "((decrease <= noise) | (cost <= before - fraction * decrease))",
             "(cost <= before + 1e300 * fraction)",
         ),
         "the size in what is active": swap(
-            ALGEBRA, "16 * EPS * (abs_b + abs_A @ size)", "0.0 * (abs_b + abs_A @ size)"
+            OPTIMIZE, "16 * EPS * (abs_b + abs_A @ size)", "0.0 * (abs_b + abs_A @ size)"
         ),
         "bounds that press are reached exactly": swap(
-            QP,
+            OPTIMIZE,
             "np.where(own > 0.0, lower, np.where(own < 0.0, upper, step))",
             "np.where(own > 0.0, 0.999 * lower, step)",
         ),
     },
     "equalities": {
-        "second-order correction": swap(STEP, "or not correcting:", "or True:"),
+        "second-order correction": swap(OPTIMIZE, "or not correcting:", "or True:"),
         "the penalty is raised": swap(
-            STEP, "return penalty if penalty >= needed else RAISED * needed", "return penalty"
+            OPTIMIZE, "return penalty if penalty >= needed else PENALTY_INCREASE * needed", "return penalty"
         ),
         "a violation that does not change ends it": swap(
-            STEP, "return equalities.predict(normal) > FALL * point.violation", "return False"
+            OPTIMIZE, "return equalities.predict(normal) > FALL * point.violation", "return False"
         ),
         "constraints are measured anew": swap(
-            STATE, "np.where(lengths > GROWN, lengths, 1.0)", "np.ones(len(lengths))"
+            OPTIMIZE, "np.where(lengths > GROWN, lengths, 1.0)", "np.ones(len(lengths))"
         ),
-        "the constraints in the Hessian of the Lagrangian": swap(STATE, "self.multipliers / units)", "0.0 * units)"),
-        "bounds of the normal step": swap(QP, "if cube.holds(shortest):", "if True:"),
-        "dependent rows": swap(QP, "sizes > DEPENDENT * sizes[0]", "sizes >= 0.0"),
+        "the constraints in the Hessian of the Lagrangian": swap(OPTIMIZE, "self.multipliers / units)", "0.0 * units)"),
+        "bounds of the normal step": swap(OPTIMIZE, "if cube.holds(shortest):", "if True:"),
+        "dependent rows": swap(OPTIMIZE, "sizes > DEPENDENT * sizes[0]", "sizes >= 0.0"),
         "curvature along the constraints alone": swap(
-            STATE,
+            OPTIMIZE,
             "np.vstack([constraints.normals[rows], point.equalities(point.reported_sides).jacobian])",
             "constraints.normals[rows]",
         ),
         "kinks that keep constraints from being met": swap(
-            STEP, "if point.kink is None or found.left <= max(HALF * point.violation, MET):", "if True:"
+            OPTIMIZE, "if point.kink is None or found.left <= max(HALF * point.violation, MET):", "if True:"
         ),
     },
     "final time": {
-        "the running cost at tf": swap(MODEL, "if self.structure.is_rest(mode):", "if False:"),
-        "rest after tf": swap(STRUCTURE, "return jnp.zeros_like(x)", "return 0.1 * x"),
+        "the running cost at tf": swap(ROWS, "if self.structure.is_rest(mode):", "if False:"),
+        "rest after tf": swap("problem", "return jnp.zeros_like(x)", "return 0.1 * x"),
         "ell(tf) in (6)": swap(
             PAPER,
             "ell_before(t, x, p) - ell_after(t, R(t, x, p), p)",
@@ -222,13 +214,13 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "D ell behind tf in (11)": swap(PAPER, "jax.grad(ell_after, argnums=1)", "jax.grad(ell_before, argnums=1)"),
     },
     "modes": {
-        "fits without corners": swap(FITTER, "not any(map(has_corners, problem.structures))", "True"),
-        "parameters that do not act are free": swap(FITTER, "lower[held] = upper[held] = theta[held]", "pass"),
-        "guarded times count": swap(MODE_POOL, 'if name == "cost" else fitted.free_switches', "if name else 0"),
+        "fits without corners": swap("modes", "not any(map(has_corners, problem.structures))", "True"),
+        "parameters that do not act are free": swap("modes", "lower[held] = upper[held] = theta[held]", "pass"),
+        "guarded times count": swap("modes", 'if name == "cost" else fitted.free_switches', "if name else 0"),
         "a switch counts once in mBIC": swap("modes/criterion.py", 'each = 2 if name == "mbic" else 1', "each = 1"),
         "what follows a pulse": swap("modes/schedule.py", "names[j if closes else j + 1 :]", "names[j + 1 :]"),
         "reset maps of another sequence": swap(
-            "engine/native/engine.py",
+            NATIVE,
             "self._named[name][:] = which",
             "self._named[name][:] = which if name == 'modes' else -1",
         ),
@@ -241,41 +233,45 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         "second moment": swap("fit/result.py", "(Z - g * (1.0 - g * Z) / s) / s", "(Z + g * (1.0 - g * Z) / s) / s"),
     },
     "other minima": {
-        "points on the same path": swap(HOPS, "if evaluator.paths == path:", "if evaluator.paths != path:"),
-        "one point beside a minimum": swap(HOPS, "BEYOND = (2.0, 4.0, 6.0)", "BEYOND = (2.0,)"),
-        "the exact Hessian alone": swap(HOPS, '= ("exact", "gauss-newton")', '= ("exact",)'),
-        "one model of an interval": swap(HOPS, "RIGHT = 8, 4, 0.2", "RIGHT = 8, 1, 0.2"),
-        "none beside a minimum": swap(CHOICE, "hops += look_near(", "_ = look_near("),
-        "chi-square hides nothing": swap(CHOICE, "DEEP = 10.0", "DEEP = 0.0"),
-        "a sigma makes up for what others are to fit": swap(HOPS, " & ~evaluator.problem.is_sigma", ""),
-        "rivals inside of the interval": swap(CHOICE, "if not low <= value <= high", "if low <= value <= high"),
-        "only a known sigma": swap(CHOICE, "strict_minimum and scale > 0.0", "strict_minimum and fit.sigma_known"),
-        "compilation counts": swap(CHOICE, "limit_time(most, measure_work,", "limit_time(most, time.perf_counter,"),
-        "re-insertion has the last word": swap(CHOICE, "return len(steps) > 2 and", "return len(steps) > 1 and"),
+        "points on the same path": swap("strategy", "if evaluator.paths == path:", "if evaluator.paths != path:"),
+        "one point beside a minimum": swap("strategy", "BEYOND = (2.0, 4.0, 6.0)", "BEYOND = (2.0,)"),
+        "the exact Hessian alone": swap("strategy", '= ("exact", "gauss-newton")', '= ("exact",)'),
+        "one model of an interval": swap("strategy", "RIGHT = 8, 4, 0.2", "RIGHT = 8, 1, 0.2"),
+        "none beside a minimum": swap("strategy", "hops += look_near(", "_ = look_near("),
+        "chi-square hides nothing": swap("strategy", "DEEP = 10.0", "DEEP = 0.0"),
+        "a sigma makes up for what others are to fit": swap("strategy", " & ~evaluator.problem.is_sigma", ""),
+        "rivals inside of the interval": swap("strategy", "if not low <= value <= high", "if low <= value <= high"),
+        "only a known sigma": swap("strategy", "strict_minimum and scale > 0.0", "strict_minimum and fit.sigma_known"),
+        "compilation counts": swap("strategy", "limit_time(most, measure_work,", "limit_time(most, time.perf_counter,"),
+        "re-insertion has the last word": swap("strategy", "return len(steps) > 2 and", "return len(steps) > 1 and"),
     },
     "beam": {
-        "sign of the jump in Z": swap(HYPOTHESES, "+ sign * graph.loads(", "- sign * graph.loads("),
+        "sign of the jump in Z": swap(NATIVE, "+ sign * graph.loads(", "- sign * graph.loads("),
         "dropped F_p": swap(
-            KERNELS, "forcing = [self._along_p(graph, f_p) for", "forcing = [self._along_p(graph, 0.0 * f_p) for"
+            NATIVE,
+            "forcing = [self._along_p(graph, f_p) for",
+            "forcing = [self._along_p(graph, 0.0 * f_p) for",
         ),
-        "column one slot off": swap(HYPOTHESES, "Column.SLOT) + 1", "Column.SLOT) + 2"),
+        "column one slot off": swap(NATIVE, "Column.SLOT) + 1", "Column.SLOT) + 2"),
         "a birth before the sample at its time": swap(
-            HYPOTHESES, 'self.invoke("at_node", table, record, here + 1)', 'self.invoke("at_node", table, record, here)'
+            NATIVE,
+            'self.invoke("at_node", table, record, here + 1)',
+            'self.invoke("at_node", table, record, here)',
         ),
         "the highest scores of a place are kept": swap(
-            HYPOTHESES, "leave(score >= self._load_score", "leave(score <= self._load_score"
+            NATIVE, "leave(score >= self._load_score", "leave(score <= self._load_score"
         ),
-        "dropped penalty": swap(BEAM, " + self.penalty * switches", ""),
+        "dropped penalty": swap("strategy", " + self.penalty * switches", ""),
         "dropped limit for each sequence": swap("strategy/library.py", "PER_SEQUENCE = 3", "PER_SEQUENCE = 3000"),
-        "sign of the shift": swap(HYPOTHESES, 'graph.load("x", i) + (', 'graph.load("x", i) - ('),
-        "scores for costs": swap(BEAM, "costs = states.costs + ((g", "costs = states.scores + 0 * ((g"),
+        "sign of the shift": swap(NATIVE, 'graph.load("x", i) + (', 'graph.load("x", i) - ('),
+        "scores for costs": swap("strategy", "costs = states.costs + ((g", "costs = states.scores + 0 * ((g"),
         "sign of what other runs say": swap("strategy/known_order.py", "Q, Q @ center - g", "Q, Q @ center + g"),
         "own parameters of other runs that do not follow": swap(
             "strategy/beam.py",
             "solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)",
             "solved = np.zeros((len(others), len(others)))",
         ),
-        "the rate of a guard": swap(HYPOTHESES, 'weight = graph.load("tolerances", 2) / (rate', "weight = 2.0 / (rate"),
+        "the rate of a guard": swap(NATIVE, 'weight = graph.load("tolerances", 2) / (rate', "weight = 2.0 / (rate"),
     },
     "corners": {
         "the tangent of a crossing's time": swap(
@@ -289,24 +285,26 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             SPLIT, "if found is not None and self._holds(split, times, p):", "if found is not None:"
         ),
         "the side behind a crossing": swap(
-            COURSE, "if leads_back and may_rest else behind", "if not may_rest else behind"
+            SPLIT, "if leads_back and may_rest else behind", "if not may_rest else behind"
         ),
         "what changes nothing": swap(SPLIT, "(kinds >= 0) & ~is_idle, is_idle", "kinds >= 0, kinds > 1e9"),
         "what is touched": swap(SPLIT, "if touched.any():", "if False:"),
-        "rounding at rest": swap("engine/adaptive.py", "coarse), p, smallest)", "coarse), p)"),
-        "sliding": swap(COURSE, "else -1\n        return 0", "else -1\n        return 1"),
-        "a jump of the input": swap(COURSE, "if after != self.sides:", "if False:"),
+        "rounding at rest": swap("engine/adaptive", "coarse), p, smallest)", "coarse), p)"),
+        "sliding": swap(SPLIT, "else -1\n        return 0", "else -1\n        return 1"),
+        "a jump of the input": swap(SPLIT, "if after != self.sides:", "if False:"),
         "the end of sliding": swap(CORNERS, "[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]"),
         "motion of a corner in time": swap(CORNERS, "[jnp.ones_like(t), f]", "[jnp.zeros_like(t), f]"),
         "motion of a corner with the input": swap(CORNERS, "jnp.stack([u[1], ", "jnp.stack([0.0 * u[1], "),
-        "sliding ends where the input bends": swap(COURSE, "== 0, drift, 0.0)", "== 2, drift, 0.0)"),
-        "an output beyond its corner": swap(STRUCTURE, "return choose_sides(trace(", "return (trace("),
-        "left on the wrong side": swap(COURSE, "2.0 * np.minimum(self._last[0], 0.0)", "0.0 * self._last[0]"),
+        "sliding ends where the input bends": swap(SPLIT, "== 0, drift, 0.0)", "== 2, drift, 0.0)"),
+        "an output beyond its corner": swap("problem", "return choose_sides(trace(", "return (trace("),
+        "left on the wrong side": swap(SPLIT, "2.0 * np.minimum(self._last[0], 0.0)", "0.0 * self._last[0]"),
         "both corners in the convex combination": swap(
             CORNERS, "(b[0] - sum(c * s for c, s in zip", "(b[0] + sum(c * s for c, s in zip"
         ),
         "the other case of a selection": swap(
-            CORNERS, "found = cases[int(which.flat[0])]", "found = lax.select_n(which, *map(jnp.asarray, cases))"
+            CORNERS,
+            "found = cases[int(which.flat[0])]",
+            "found = lax.select_n(which, *map(jnp.asarray, cases))",
         ),
         "corners that are one": swap(CORNERS, "tuple(sorted(pair))", "pair"),
         "a rounded state that jumps": swap(
@@ -314,59 +312,59 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
         "corners of two states that are not one": swap(CORNERS, '"argument", k, i', '"argument", k, 0'),
         "the margin of a steep corner": swap(CORNERS, "if sides[k] == side:", "if False:"),
-        "rates at a steep corner": swap(COURSE, "if exact[:, k].max() <= STILL_STEEP * exact.max():", "if False:"),
+        "rates at a steep corner": swap(SPLIT, "if exact[:, k].max() <= STILL_STEEP * exact.max():", "if False:"),
         "passed by an error of the solver": swap(
-            COURSE, "if found is not None and not self._returns(found, inside):", "if found:"
+            SPLIT, "if found is not None and not self._returns(found, inside):", "if found:"
         ),
         "a Gauss-Newton matrix called exact": swap(
             SPLIT, 'if split.has_gauss_newton and matrix == "exact":', "if False:"
         ),
         "the size of a corner where a mode begins": swap(
-            COURSE, "= self._guess_scale(t, x, inside)", "= np.zeros(self.corners.count)"
+            SPLIT, "= self._guess_scale(t, x, inside)", "= np.zeros(self.corners.count)"
         ),
     },
     "online": {
         "what has left the window is a diagonal": swap(
-            TRACKER, "(self.matrix + artificial)[None]", "(np.diag(np.diag(self.matrix)) + artificial)[None]"
+            "online", "(self.matrix + artificial)[None]", "(np.diag(np.diag(self.matrix)) + artificial)[None]"
         ),
-        "what has left the window counts half": swap(TRACKER, "slope = along[:, :D]", "slope = 0.5 * along[:, :D]"),
+        "what has left the window counts half": swap("online", "slope = along[:, :D]", "slope = 0.5 * along[:, :D]"),
         "no minimum along what has no effect": swap(
-            TRACKER,
+            "online",
             "H -= row[:, :, None] * row[:, None, :] / pivot",
             "H -= 0 * row[:, :, None] * row[:, None, :] / pivot",
         ),
         "a new value is not joined to the old one": swap(
-            TRACKER, "[[1.0, -1.0], [-1.0, 1.0]]", "[[1.0, 0.0], [0.0, 1.0]]"
+            "online", "[[1.0, -1.0], [-1.0, 1.0]]", "[[1.0, 0.0], [0.0, 1.0]]"
         ),
         "the old value still moves the state": swap(
-            TRACKER, "tangent[:, :entries], tangent[:, chosen] = 0.0, 0.0", "tangent[:, :entries] = 0.0"
+            "online", "tangent[:, :entries], tangent[:, chosen] = 0.0, 0.0", "tangent[:, :entries] = 0.0"
         ),
         "the hypotheses that decide are not propagated anew": swap(
-            TRACKER, "found.records[chosen] = anew.records[good]", "anew.records[good]"
+            "online", "found.records[chosen] = anew.records[good]", "anew.records[good]"
         ),
         "a late sample changes nothing before it": swap(
-            ONLINE, "changed = min(changed, node)", "changed = min(changed, node + 1)"
+            "online", "changed = min(changed, node)", "changed = min(changed, node + 1)"
         ),
         "a late sample keeps its time stamp": swap(
-            ONLINE, "t - float(self._sensors[k].delay)", "t - 0 * float(self._sensors[k].delay)"
+            "online", "t - float(self._sensors[k].delay)", "t - 0 * float(self._sensors[k].delay)"
         ),
-        "a model that has lost the samples recovers": swap(ONLINE, "self._lost = now", "self._lost = None"),
-        "inputs hold before they come": swap(ONLINE, "return given if before is None else before", "return given"),
-        "the journal forgets the inputs": swap(TRACKER, '"u": u}', '"u": None}'),
+        "a model that has lost the samples recovers": swap("online", "self._lost = now", "self._lost = None"),
+        "inputs hold before they come": swap("online", "return given if before is None else before", "return given"),
+        "the journal forgets the inputs": swap("online", '"u": u}', '"u": None}'),
     },
     "design": {
-        "sign of the criterion's slope": swap(CRITERION, "return mean, -xp.swapaxes", "return mean, xp.swapaxes"),
-        "A in place of D": swap(CRITERION, '{"D": 0.0,', '{"D": 1.0,'),
-        "information of one side": swap(CRITERION, "SIDES = (1, -1)", "SIDES = (1, 1)"),
-        "scales left out": swap(CRITERION, "basis[self.chosen] / self.scales[:, None]", "basis[self.chosen]"),
-        "priors and other runs left out": swap(CRITERION, "self.information - sum(found))", "0 * self.information)"),
-        "guarded times stay where they are": swap(EVALUATOR, "Z[guarded] = -np.linalg", "Z[guarded] = -0 * np.linalg"),
-        "weights of samples left out": swap(CRITERION, "taken, C, w, C)", "taken, C, w**0, C)"),
-        "information of sigma once": swap(CRITERION, "+ 2.0 * jnp.einsum", "+ 1.0 * jnp.einsum"),
-        "gradient of one side": swap(CRITERION, ".mean(0)", "[0]"),
-        "limits of inputs ignored": swap(CRITERION, "bounds=[(0.0, 1.0)]", "bounds=[(-1.0, 2.0)]"),
-        "samples of two sensors are exchanged": swap(CRITERION, "~taken & (sensor == sensor[out])", "~taken"),
-        "no exchange": swap(CRITERION, "while improved:", "while not improved:"),
+        "sign of the criterion's slope": swap(DESIGN, "return mean, -xp.swapaxes", "return mean, xp.swapaxes"),
+        "A in place of D": swap(DESIGN, '{"D": 0.0,', '{"D": 1.0,'),
+        "information of one side": swap(DESIGN, "SIDES = (1, -1)", "SIDES = (1, 1)"),
+        "scales left out": swap(DESIGN, "basis[self.chosen] / self.scales[:, None]", "basis[self.chosen]"),
+        "priors and other runs left out": swap(DESIGN, "self.information - sum(found))", "0 * self.information)"),
+        "guarded times stay where they are": swap("fit", "Z[guarded] = -np.linalg", "Z[guarded] = -0 * np.linalg"),
+        "weights of samples left out": swap(DESIGN, "taken, C, w, C)", "taken, C, w**0, C)"),
+        "information of sigma once": swap(DESIGN, "+ 2.0 * jnp.einsum", "+ 1.0 * jnp.einsum"),
+        "gradient of one side": swap(DESIGN, ".mean(0)", "[0]"),
+        "limits of inputs ignored": swap(DESIGN, "bounds=[(0.0, 1.0)]", "bounds=[(-1.0, 2.0)]"),
+        "samples of two sensors are exchanged": swap(DESIGN, "~taken & (sensor == sensor[out])", "~taken"),
+        "no exchange": swap(DESIGN, "while improved:", "while not improved:"),
     },
 }
 """Those that were thought of, by part and name."""
@@ -378,15 +376,19 @@ MISTAKES = {(part, name): mistake for part, found in BY_HAND.items() for name, m
 """All of them, with those that are drawn."""
 
 
-def mutate(part: str, name: str) -> tuple[str, str]:
-    """Return the file of a mistake and its text with the mistake; ValueError unless each text occurs exactly once."""
-    path, replacements = MISTAKES[part, name]
-    text = (SOURCE / path).read_text()
+def mutate(part: str, name: str) -> dict[str, str]:
+    """Return the files of a mistake with the mistake in them; ValueError unless the room has each text exactly once."""
+    where, replacements = MISTAKES[part, name]
+    paths = sorted((SOURCE / where).rglob("*.py")) or [SOURCE / where]
+    files = {str(path.relative_to(SOURCE)): path.read_text() for path in paths}
+    changed = {}
     for old, new in replacements:
-        if text.count(old) != 1:
-            raise ValueError(f"{path}: found {text.count(old)} times instead of once: {old!r}")
-        text = text.replace(old, new)
-    return path, text
+        counts = {path: text.count(old) for path, text in files.items() if old in text}
+        if list(counts.values()) != [1]:
+            raise ValueError(f"{where}: found in {counts} instead of once: {old!r}")
+        (path,) = counts
+        changed[path] = files[path] = files[path].replace(old, new)
+    return changed
 
 
 def copy_package(folder: Path) -> Path:

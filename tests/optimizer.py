@@ -4,8 +4,10 @@ import numpy as np
 
 from switchfit.optimize import LinearConstraints
 from switchfit.optimize import minimize as minimize_problem
-from switchfit.optimize.problem import Breakpoints, Problem
-from switchfit.optimize.qp import CholeskyFactor, Room, solve_programme
+from switchfit.optimize.breakpoints import Breakpoints
+from switchfit.optimize.minimization_problem import MinimizationProblem
+from switchfit.optimize.positive_definite import CholeskyFactor
+from switchfit.optimize.qp import Room, solve_programme
 
 
 def rows(A, b, lower=None, upper=None):
@@ -34,7 +36,7 @@ def minimize(
     start = np.array(start, float)
     labels = np.array(blocks, float) if hessian == "block-diagonal" else None
     size, usual = np.broadcast_to(np.asarray(size, float), start.shape), 0.1 * np.where(start, abs(start), 1.0)
-    problem = Problem(
+    problem = MinimizationProblem(
         evaluate, constraints, Breakpoints.of(breakpoints), hessian, labels, tolerance, max_iterations, size, idle,
         usual if reach is None else np.asarray(reach, float), equalities, accuracy,
     )  # fmt: skip

@@ -14,14 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.discretization.mesh import Arguments, Mesh, build_arguments
+from switchfit.discretization.arguments import Arguments, build_arguments
+from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model
-from switchfit.engine.jax import derivatives
+from switchfit.engine.jax.programs import derivatives
 from switchfit.paper_adjoint import compute_paper_derivatives
-from switchfit.problem.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
+from switchfit.problem.costs import RunningCost, TerminalCost
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.functions import use_float64
+from switchfit.problem.inputs import Input
+from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
+from switchfit.problem.reference_signals import ReferenceSignal
 from switchfit.problem.structure import Structure
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.cache import use_compilation_cache

@@ -14,7 +14,7 @@ import pytest
 from derivatives import differentiate
 from systems import KINDS, NODES, P0, Parameter, case, closed_form, closed_form_case, padded_mesh
 
-from switchfit.discretization.mesh import build_arguments
+from switchfit.discretization.arguments import build_arguments
 
 # A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
 SMOOTH_KINDS = ("running", "reference", "terminal")

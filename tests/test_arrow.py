@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from optimizer import box, minimize, rows, solve_qp
 
-from switchfit.optimize.matrix import Arrow, ArrowFactor, ArrowLayout, Dense, diagonal_scaling, null_space
+from switchfit.optimize.arrow import Arrow, ArrowFactor, ArrowLayout
+from switchfit.optimize.curvature import null_space
+from switchfit.optimize.dense import Dense
 from switchfit.optimize.qp import Room
+from switchfit.optimize.symmetric_matrix import diagonal_scaling
 
 PLACES = [np.array([0, 1, 2, 9, 10]), np.array([3, 4, 9, 10]), np.array([5, 6, 7, 10, 9]), np.array([8, 9])]
 LAYOUT = ArrowLayout.of(11, PLACES)

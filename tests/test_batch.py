@@ -26,8 +26,11 @@ from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.models import heater_problem
-from switchfit.optimize.qp import nearest_feasible
-from switchfit.optimize.traced import Breakpoints, Constraints, Task, minimize_traced, nonnegative_minimum
+from switchfit.optimize.least_distance import nearest_feasible
+from switchfit.optimize.traced_constraints import TracedBreakpoints, TracedConstraints
+from switchfit.optimize.traced_qp import nonnegative_minimum
+from switchfit.optimize.traced_sqp import minimize_traced
+from switchfit.optimize.traced_state import TracedProblem
 from switchfit.problem.functions import use_float64
 from switchfit.strategy.starts import draw_starts
 
@@ -83,9 +86,9 @@ def kinked(theta, side, H, centre, weights, xp):
 def fitted_with_kinks(start, H, centre, weights):
     """The traced optimiser on `kinked`, its first two coordinates in order."""
     evaluate = partial(kinked, H=H, centre=centre, weights=weights, xp=jnp)
-    constraints = Constraints(jnp.array([[-1.0, 1.0, 0.0]]), jnp.zeros(1), jnp.zeros(3), jnp.full(3, 10.0))
-    breakpoints = Breakpoints(np.arange(3), jnp.asarray(np.tile(KNOTS, (3, 1))))
-    return minimize_traced(Task(evaluate, constraints, breakpoints, 1e-9, 200), start)
+    constraints = TracedConstraints(jnp.array([[-1.0, 1.0, 0.0]]), jnp.zeros(1), jnp.zeros(3), jnp.full(3, 10.0))
+    breakpoints = TracedBreakpoints(np.arange(3), jnp.asarray(np.tile(KNOTS, (3, 1))))
+    return minimize_traced(TracedProblem(evaluate, constraints, breakpoints, 1e-9, 200), start)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4])

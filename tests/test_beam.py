@@ -13,7 +13,7 @@ from test_schedule import make_library
 import switchfit as sf
 from benchmarks.modes.truths import three_modes
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.protocol import Column, Hypotheses
+from switchfit.engine.hypotheses import Column, Hypotheses
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, collapse
 from switchfit.strategy import beam as beams

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.cli import fitting
-from switchfit.io.problem_file import load_problem
+from switchfit.cli import fit
+from switchfit.io.problem_file.loading import load_problem
 
 PROBLEM = """
 model = "room.py:room"
@@ -343,8 +343,8 @@ def test_a_fit_waits_for_the_modules_that_draw(folder, monkeypatch):
         time.sleep(0.3)
         done.append(True)
 
-    monkeypatch.setattr(fitting, "_import_figures", import_figures)
-    fitting.estimate_problem(load_problem(folder / "problem.toml"), prepare_figures=True)
+    monkeypatch.setattr(fit, "_import_figures", import_figures)
+    fit.estimate_problem(load_problem(folder / "problem.toml"), prepare_figures=True)
     assert done
 
 

@@ -11,8 +11,8 @@ from models import approach
 from test_cli import catch_settings, run
 
 import switchfit as sf
-from switchfit.io.problem_file import load_problem
-from switchfit.io.problem_file.writing import write_fitted_problem
+from switchfit.cli.fitted_problem import write_fitted_problem
+from switchfit.io.problem_file.loading import load_problem
 
 MODEL = """
 import jax.numpy as jnp

@@ -17,9 +17,8 @@ from models import decay as decay_at_k
 
 import switchfit as sf
 from switchfit.discretization.mesh import pad_length
-from switchfit.engine.adaptive import call_model
-from switchfit.engine.jax import derivatives, simulate_rows
-from switchfit.engine.native.program import _program_of, drop_programs
+from switchfit.engine.jax.programs import call_model, derivatives, simulate_rows
+from switchfit.engine.native.program_cache import _program_of, drop_programs
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.problem import functions
 from switchfit.runtime import SMALL_LOOPS, compile_small_loops_whole

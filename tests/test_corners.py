@@ -16,14 +16,16 @@ from benchmarks.sharp import problems as sharp
 from benchmarks.sharp.corners import integrate
 from benchmarks.sharp.problems import relay as relay_case
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine import jax as jax_programs
-from switchfit.engine.adaptive import refine_mesh
-from switchfit.engine.branches import MOST_CROSSINGS, trace_for_numpy
-from switchfit.engine.choice import SplitEngine
-from switchfit.engine.native.templates import Order, Sizes, Templates
-from switchfit.engine.protocol import runs_of
+from switchfit.engine.corners.branch_functions import trace_for_numpy
+from switchfit.engine.corners.branches import MOST_CROSSINGS
+from switchfit.engine.corners.split_engine import SplitEngine
+from switchfit.engine.jax import jax_engine
+from switchfit.engine.native.sizes import Order, Sizes
+from switchfit.engine.native.templates import Templates
+from switchfit.engine.run import runs_of
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.problem.corners import find_corners
+from switchfit.meshes.refinement import refine_mesh
+from switchfit.problem.corners.branches import find_corners
 from switchfit.problem.functions import use_float64
 from switchfit.runtime.errors import NotIntegrableError
 
@@ -672,7 +674,7 @@ def rooted(t, x, p):
 )
 def test_points_at_which_it_cannot_be_followed_have_no_cost(problem, theta, monkeypatch):
     """JAX is not asked for a program of each path, to find that a derivative is infinite."""
-    monkeypatch.setattr(jax_programs, "derivatives", None)
+    monkeypatch.setattr(jax_engine, "derivatives", None)
     evaluator = Evaluator(problem)
     for _ in range(2):
         assert np.isfinite(evaluator.cost(problem.initial_theta))

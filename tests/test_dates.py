@@ -22,12 +22,15 @@ from models import charge, decay, first_state, refused, temperature
 from test_cli import run
 
 import switchfit as sf
-from switchfit.io.command_line import summarize_estimate, write_runs, write_unknowns
-from switchfit.io.problem_file import load_problem
-from switchfit.problem.dates import SECONDS, Dates, Origin, from_epoch, make_origin, read_dates
-from switchfit.report.axes import DateLocator
-from switchfit.report.formats import format_date, format_time
+from switchfit.cli.summaries import summarize_estimate
+from switchfit.cli.tables import write_runs, write_unknowns
+from switchfit.io.problem_file.loading import load_problem
+from switchfit.problem.dates import Dates, from_epoch, read_dates
+from switchfit.problem.origin import Origin, make_origin
+from switchfit.problem.time_units import SECONDS_OF_UNIT
+from switchfit.report.date_axis import DateLocator
 from switchfit.report.style import label_axis
+from switchfit.report.times import format_date, format_time
 from switchfit.runtime.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -124,13 +127,13 @@ ZONES = st.sampled_from(["UTC", "Europe/Berlin", "Asia/Kathmandu", "America/St_J
 
 
 @settings(max_examples=30)
-@given(MICROSECONDS, MICROSECONDS, ZONES, st.sampled_from(list(SECONDS)))
+@given(MICROSECONDS, MICROSECONDS, ZONES, st.sampled_from(list(SECONDS_OF_UNIT)))
 def test_a_number_is_the_exact_difference_rounded_once(start, instant, zone, unit):
     origin = make_origin(start, zone)
     assert origin.instant == start
     assert Origin(origin.date, origin.time_zone) == origin
     number = origin.to_numbers(Dates(np.array(instant), "UTC"), unit)
-    exact = Fraction(int((instant - start).astype(int))) / Fraction(round(1e9 * SECONDS[unit]), 1000)
+    exact = Fraction(int((instant - start).astype(int))) / Fraction(round(1e9 * SECONDS_OF_UNIT[unit]), 1000)
     assert abs(Fraction(float(number)) - exact) <= abs(exact) * Fraction(2, 2**53)
 
 

@@ -25,7 +25,7 @@ from switchfit.experiment_design import (
     stack_inputs,
 )
 from switchfit.fit.evaluator import Evaluator
-from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.loading import load_problem
 from switchfit.models import heater_problem
 from switchfit.problem.functions import use_float64
 

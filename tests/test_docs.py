@@ -19,8 +19,8 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.engine.native import arrays, trace
-from switchfit.io.problem_file import load_problem
+from switchfit.engine.native.tracing import entries, matrices, sorting, trace
+from switchfit.io.problem_file.loading import load_problem
 
 matplotlib.use("agg")
 
@@ -156,12 +156,12 @@ def test_the_page_claims_machine_code_only_for_what_has_it():
     ("row", "limits"),
     [
         ("branches, loops", (trace.MOST_NODES,)),
-        ("tables of numbers", (arrays.MOST_ROWS_OF_TABLE,)),
-        ("tables of parameters", (arrays.MOST_CHOICES,)),
-        ("indices that depend", (arrays.MOST_CHOICES,)),
-        ("linear systems", (arrays.MOST_ROWS_TO_PIVOT,)),
-        ("Cholesky", (arrays.MOST_ROWS, arrays.MOST_KNOWN_ROWS)),
-        ("sorting", (arrays.MOST_SORTED,)),
+        ("tables of numbers", (entries.MOST_ROWS_OF_TABLE,)),
+        ("tables of parameters", (entries.MOST_CHOICES,)),
+        ("indices that depend", (entries.MOST_CHOICES,)),
+        ("linear systems", (matrices.MOST_ROWS_TO_PIVOT,)),
+        ("Cholesky", (matrices.MOST_ROWS, matrices.MOST_KNOWN_ROWS)),
+        ("sorting", (sorting.MOST_SORTED,)),
     ],
 )
 def test_the_limits_on_the_page_are_those_of_the_code(row, limits):

@@ -10,7 +10,7 @@ import pytest
 
 import switchfit as sf
 from switchfit import models
-from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.loading import load_problem
 
 matplotlib.use("agg")
 

@@ -10,8 +10,10 @@ import pytest
 import scipy.optimize
 from optimizer import box, free, minimize
 
-from switchfit.optimize import Status, step
-from switchfit.optimize.qp import Equalities, Room, find_normal_step, solve_composite
+from switchfit.optimize import Status, merit
+from switchfit.optimize.composite_step import find_normal_step, solve_composite
+from switchfit.optimize.equalities import Equalities
+from switchfit.optimize.qp import Room
 from switchfit.problem.functions import use_float64
 
 Here = namedtuple("Here", "cost gradient hessian constraints jacobian")
@@ -161,7 +163,7 @@ def test_constraints_that_cannot_be_met_are_named(constraints, violated, evaluat
 
 def test_constraints_are_not_stuck_where_a_step_reduces_their_violation(monkeypatch):
     """However long it has stayed the same: here, from the first iteration on."""
-    monkeypatch.setattr(step, "STAGNANT", 0)
+    monkeypatch.setattr(merit, "STAGNANT", 0)
     found = solve(lambda x: x[0] + x[1], ON_CIRCLE, [3.0, -2.0], status=Status.CONVERGED)
     np.testing.assert_allclose(found.theta, [-1.0, -1.0], atol=1e-7)
 

@@ -20,7 +20,7 @@ from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.paper.vehicle import build_simulated_problem
-from switchfit.runtime.errors import Issue
+from switchfit.runtime.issue import Issue
 
 # A capacitor that is charged through one resistor and discharged through another one
 

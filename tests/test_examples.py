@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.loading import load_problem
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -13,7 +13,7 @@ from models import fit_problem
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import explain_nonfinite
-from switchfit.problem.inspection import find_undefined
+from switchfit.problem.finiteness import find_undefined
 from switchfit.runtime.errors import NotIntegrableError
 
 TIMES = np.linspace(0.1, 4.0, 30)

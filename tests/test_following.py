@@ -8,14 +8,14 @@ import pytest
 
 import switchfit as sf
 from benchmarks.sharp.problems import spring
-from switchfit.discretization import propagation, rows
-from switchfit.discretization.rows import EXPLICIT, EXPLICIT_BEND, EXPLICIT_ERROR, STIFF, STIFF_BEND
-from switchfit.engine.adaptive import refine_mesh, refine_mesh_of_run
+from switchfit.discretization import row_errors, rows, steps
+from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_BEND, EXPLICIT_ERROR, STIFF, STIFF_BEND
 from switchfit.engine.native.kernels import JUMP_WEIGHT
-from switchfit.engine.native.templates import Order
+from switchfit.engine.native.sizes import Order
 from switchfit.fit import accuracy
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.refinement import refine_mesh, refine_mesh_of_run
 from switchfit.problem.functions import use_float64
 
 G, SLOW = 9.81, 1e-2
@@ -76,7 +76,7 @@ def test_the_errors_of_rows_are_those_of_the_embedded_method():
         errors = np.abs(h * EXPLICIT_ERROR @ np.stack(slopes))
         bends = [-mu * G * SLOW**2 / (X[1] ** 2 + SLOW**2) ** 1.5 for X in (states[0], states[-1])]
         f_x = [np.array([[0.0, 1.0], [0.0, bend]]) for bend in bends]
-        jumps = JUMP_WEIGHT * rows.measure_jump(*judge(h, slopes, states, f_x, EXPLICIT_BEND), np)
+        jumps = JUMP_WEIGHT * row_errors.measure_jump(*judge(h, slopes, states, f_x, EXPLICIT_BEND), np)
         largest = np.maximum(largest, np.maximum(errors, jumps))
     found = evaluator.judge_rows()(theta).row_errors[0]
     # They are made of differences of states, which are of size 1 and have rounding errors.
@@ -95,10 +95,10 @@ def judge(h, slopes, states, f_x, weights):
 def measure(f, f_x, tableau, weights, h):
     """The jump of a row of x' = f(t, x) from 1 at 0, whose slope in t is 0 beside jumps."""
     with use_float64():
-        found = propagation.compute_stages(tableau, lambda t, x: jnp.stack([f(t, x[0])]), 0.0, h, jnp.ones(1))
+        found = steps.compute_stages(tableau, lambda t, x: jnp.stack([f(t, x[0])]), 0.0, h, jnp.ones(1))
         found = rows.Stages(*([np.asarray(value) for value in part] for part in found))
     slopes = [np.array([[f_x(found.times[j], found.states[j][0])]]) for j in (0, -1)]
-    return float(rows.measure_jump(*judge(h, found.slopes, found.states, slopes, weights), np)[0])
+    return float(row_errors.measure_jump(*judge(h, found.slopes, found.states, slopes, weights), np)[0])
 
 
 @pytest.mark.parametrize(("tableau", "weights"), [(EXPLICIT, EXPLICIT_BEND), (STIFF, STIFF_BEND)])

@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from functions import FALLS_BACK, FUNCTIONS, LEFT_AT_SOME_POINTS, ZERO_TIMES_INFINITY
 
-from switchfit.engine.native import llvm
-from switchfit.engine.native.scalars import CHECKED, Graph
-from switchfit.engine.native.trace import Unsupported, trace_scalars
+from switchfit.engine.native.llvm import compilation
+from switchfit.engine.native.llvm import module as module_module
+from switchfit.engine.native.scalars.graph import CHECKED, Graph
+from switchfit.engine.native.tracing.trace import trace_scalars
+from switchfit.engine.native.tracing.unsupported import Unsupported
 from switchfit.problem.functions import use_float64
 
 pytestmark = pytest.mark.promotes
@@ -56,11 +58,11 @@ def machine_code_of(template, count):
     outputs = template(graph, graph.loads("x", 3), graph.loads("w", count), checked=True)
     ends = np.cumsum([output.size for output in outputs])
     nodes = np.concatenate([output.reshape(-1) for output in outputs])
-    module = llvm.Module(4)
+    module = module_module.Module(4)
     stores = [("y", k, node) for k, node in enumerate(nodes)] + graph.check()
     module.write_straight_line("f", stores)
     names = module.pointers["f"]
-    program = llvm.compile_modules([module.take()])  # the code is gone with it
+    program = compilation.compile_modules([module.take()])  # the code is gone with it
 
     def evaluate(x, w):
         y, wrong = np.full(ends[-1], 7e77), np.zeros(1)

@@ -18,7 +18,7 @@ import pytest
 
 import switchfit as sf
 from switchfit.models import heater_problem
-from switchfit.problem import functions
+from switchfit.problem import contents, functions
 from switchfit.problem.functions import Call, trace_function, use_float64
 
 SAMPLES = sf.Measurements([0.5, 1.0], [math.exp(-0.5), math.exp(-1.0)], sigma=0.1)
@@ -219,7 +219,7 @@ def test_a_function_that_reads_plain_things_is_not_called_again(monkeypatch):
 
 def test_values_of_different_types_are_different():
     values = [0.0, -0.0, 1, True, 1.0, "1", np.float64(1.0), np.ones(1), [1.0], (1.0,), {"a": 1.0}, np.ones(1, int)]
-    read = [functions.read_contents(lambda value=value: value) for value in values]
+    read = [contents.read_contents(lambda value=value: value) for value in values]
     assert None not in read
     assert len(set(read)) == len(values)
 

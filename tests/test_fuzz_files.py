@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli, paper
-from switchfit.engine.native.program import drop_programs
+from switchfit.engine.native.program_cache import drop_programs
 from switchfit.io.problem_file import tables
 
 SIZES = [pytest.param(40, id="short"), pytest.param(1200, id="long", marks=pytest.mark.fuzz)]

@@ -21,11 +21,12 @@ from models import RAMP
 from test_cli import run
 
 import switchfit as sf
-from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.loading import load_problem
 from switchfit.models import heater_problem
-from switchfit.report.html.curves import VISIBLE, build_sliders, collect_curves, evaluate_moved, find_range, list_places
-from switchfit.report.plot import find_plane
-from switchfit.report.text import tabulate_unknowns
+from switchfit.report.html.curves import collect_curves, list_places
+from switchfit.report.html.sliders import VISIBLE, build_sliders, evaluate_moved, find_range
+from switchfit.report.plane import find_plane
+from switchfit.report.unknowns import tabulate_unknowns
 from switchfit.runtime.presentation import format_page
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals

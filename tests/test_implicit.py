@@ -13,18 +13,23 @@ from models import decay, first_state, one_run
 from systems import P0, case
 
 import switchfit as sf
-from switchfit.discretization.rows import STIFF, STIFF_BEND, measure_jump
+from switchfit.discretization.row_errors import measure_jump
+from switchfit.discretization.tableaus import STIFF, STIFF_BEND
 from switchfit.engine import adaptive
-from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.adaptive import step_times
 from switchfit.engine.choice import derivatives_inside_program
-from switchfit.engine.native import arrays, kernels, llvm
-from switchfit.engine.native.engine import native_experiment, places_in_library
-from switchfit.engine.native.program import drop_programs
-from switchfit.engine.native.scalars import Graph
-from switchfit.engine.native.templates import Order
-from switchfit.engine.protocol import runs_of
+from switchfit.engine.native import elimination, kernels
+from switchfit.engine.native.library_places import places_in_library
+from switchfit.engine.native.llvm import compilation
+from switchfit.engine.native.llvm import module as module_module
+from switchfit.engine.native.native_experiment import native_experiment
+from switchfit.engine.native.program_cache import drop_programs
+from switchfit.engine.native.scalars.graph import Graph
+from switchfit.engine.native.sizes import Order
+from switchfit.engine.run import runs_of
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.refinement import refine_mesh
 from switchfit.problem.functions import use_float64
 
 SQUARE = sf.RunningCost(lambda t, x, p: x[0] ** 2)
@@ -136,7 +141,7 @@ def assert_same(found, expected):
 
 def test_stages_one_at_a_time(monkeypatch):
     """As where functions would become too long."""
-    monkeypatch.setattr(kernels, "SHORT", 0)
+    monkeypatch.setattr(kernels, "MOST_CURVATURE_AT_ONCE", 0)
     drop_programs()
     this = case("mixed")
     arguments = this.arguments()
@@ -241,7 +246,7 @@ def test_a_routine_for_the_linear_systems(monkeypatch):
     """It takes the place of straight-line code in large and dense systems: here in all rows, and adaptive steps."""
     native, by_jax = both("everything")
     theta = native.problem.initial_theta
-    monkeypatch.setattr(arrays, "MOST_PRODUCTS", 0)
+    monkeypatch.setattr(elimination, "MOST_PRODUCTS", 0)
     drop_programs()
     assert refine_mesh(native.problem, 0, theta).cells == native.meshes[0].cells
     found, expected = Evaluator(native.problem, meshes=native.meshes)(theta), by_jax(theta)
@@ -324,13 +329,13 @@ def make_jacobian(rng, n, kind):
 def compile_solve(filled, kind):
     """Return a function that solves the coupled equations for Jacobians (3, n, n) with these entries."""
     n = len(filled)
-    module, graph = llvm.Module(6), Graph()
+    module, graph = module_module.Module(6), Graph()
     f_x = [graph.loads("f_x", n * n, n * n * j).reshape(n, n) * filled for j in range(3)]
     right = [graph.loads("right", n, n * j, vector=kind == "vectors") for j in range(3)]
-    factors = arrays.eliminate(STIFF.a, graph.constant(1.0), f_x)
+    factors = elimination.eliminate(STIFF.a, graph.constant(1.0), f_x)
     x = np.concatenate(factors.solve(right, transposed=kind == "transposed"))
     module.write_straight_line("run", [("x", k, node) for k, node in enumerate(x)])
-    program = llvm.compile_modules([module.take()])
+    program = compilation.compile_modules([module.take()])
     run = program.function("run", 3)
 
     def solve(f_x, right):
@@ -379,7 +384,7 @@ def test_elimination_needs_no_pivots(kind, n, limit, way):
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("n", [3, 9, 40])
 def test_a_routine_eliminates_with_pivots(n, way, monkeypatch):
-    monkeypatch.setattr(arrays, "MOST_PRODUCTS", 0)
+    monkeypatch.setattr(elimination, "MOST_PRODUCTS", 0)
     rng = np.random.default_rng(4)
     solve = compile_solve(np.ones((n, n)), way)
     jacobians = (make_jacobian(rng, n, kind) for kind in ("stable", "unstable", "any") for _ in range(1000 // n))
@@ -392,7 +397,7 @@ def test_the_order_of_elimination_keeps_an_arrow_sparse():
     n = 30
     arrow = np.eye(n, dtype=bool)
     arrow[0] = arrow[:, 0] = True
-    order, products = arrays.order_states(arrow)
+    order, products = elimination.order_states(arrow)
     assert order[-2:] == [0, n - 1]
     assert products == 4 * (n - 1) + 1
 
@@ -438,6 +443,6 @@ def test_the_errors_of_rows_are_those_of_hairer_and_wanner():
 def test_adaptive_steps_are_about_as_many_as_those_of_scipy(name, monkeypatch):
     problem = PROBLEMS[name](engine="native")
     (run,), theta = runs_of(problem), problem.initial_theta
-    own = len(adaptive.solve_adaptively(run, theta))
+    own = len(step_times.solve_adaptively(run, theta))
     monkeypatch.setattr(adaptive, "native_experiment", lambda *_, **__: None)
-    assert own / 1.2 < len(adaptive.solve_adaptively(run, theta)) < 1.5 * own
+    assert own / 1.2 < len(step_times.solve_adaptively(run, theta)) < 1.5 * own

@@ -11,10 +11,10 @@ import pytest
 from test_cli import run
 
 import switchfit as sf
-from switchfit import io
-from switchfit.io import find_examples
-from switchfit.io.problem_file import load_problem, writing
-from switchfit.io.problem_file.writing import choose_channels, write_first_problem
+from switchfit.cli import examples, first_problem
+from switchfit.cli.examples import find_examples
+from switchfit.cli.first_problem import choose_channels, write_first_problem
+from switchfit.io.problem_file.loading import load_problem
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -79,7 +79,7 @@ def test_a_log_in_another_multiple_of_a_state_s_unit_is_refused(tmp_path):
 
 def test_a_large_log_is_referred_to(tmp_path, monkeypatch):
     log = write_log(tmp_path / "log.csv")
-    monkeypatch.setattr(writing, "LARGEST_COPY", 100)
+    monkeypatch.setattr(first_problem, "LARGEST_COPY", 100)
     written = write_first_problem(tmp_path / "new", log)
     assert [path.name for path in written] == ["problem.toml", "model.py"]
     assert 'file = "../log.csv"' in (tmp_path / "new" / "problem.toml").read_text()
@@ -149,5 +149,5 @@ def test_installed_examples_come_first(tmp_path, monkeypatch):
     assert find_examples() == EXAMPLES
     package = tmp_path / "switchfit"
     shutil.copytree(EXAMPLES / "toss", package / "examples" / "toss")
-    monkeypatch.setattr(io, "PACKAGE", package)
+    monkeypatch.setattr(examples, "PACKAGE", package)
     assert find_examples() == package / "examples"

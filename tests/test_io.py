@@ -8,9 +8,9 @@ import pytest
 from test_cli import run
 
 import switchfit as sf
-from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.loading import load_problem
 from switchfit.io.user_files import load_object
-from switchfit.report.text import write_problem
+from switchfit.report.problem import write_problem
 from switchfit.runtime.errors import InputError
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

@@ -12,14 +12,15 @@ from models import one_run, refused
 from scipy.optimize import least_squares
 
 import switchfit as sf
-from switchfit.engine.native.engine import foreign_derivatives, places_in_library
+from switchfit.cli.summaries import summarize_estimate
+from switchfit.engine.native.foreign import foreign_derivatives
+from switchfit.engine.native.library_places import places_in_library
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import idle_unknowns
-from switchfit.io.command_line import summarize_estimate
-from switchfit.io.problem_file import load_problem, read_experiments
+from switchfit.io.problem_file.loading import load_problem, read_experiments
 from switchfit.problem.functions import use_float64
 from switchfit.report.html.curves import collect_curves
-from switchfit.report.text import write_experiments
+from switchfit.report.problem import write_experiments
 
 DOSES = np.array([0.0, 8.0, 16.0, 24.0])
 AMOUNT = 100.0

@@ -23,7 +23,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.io import savemat
 
 import switchfit as sf
-from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.loading import load_problem
 from switchfit.runtime.errors import InputError
 
 START = datetime(2024, 5, 1, 12, 0, 0, tzinfo=UTC)

@@ -16,8 +16,8 @@ from test_batch_intervals import eaten, leaky
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import _to_variables
-from switchfit.optimize.matrix import Arrow
-from switchfit.problem.unknowns import Variables
+from switchfit.optimize.arrow import Arrow
+from switchfit.problem.variables import Variables
 from switchfit.strategy.starts import draw_starts
 
 TENTHS = np.linspace(0.1, 2.0, 20)

@@ -10,8 +10,8 @@ import pytest
 from test_cli import PROBLEM, ROOM, log_of, run
 
 import switchfit as sf
-from switchfit.io.logs import find_logs, name_files
-from switchfit.io.problem_file import load_problem
+from switchfit.io.logs.files import find_logs, name_files
+from switchfit.io.problem_file.loading import load_problem
 from switchfit.runtime.errors import InputError
 
 

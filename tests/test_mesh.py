@@ -13,14 +13,17 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import switchfit as sf
-from switchfit.discretization import rows
-from switchfit.discretization.mesh import Mesh, build_arguments, build_rows, find_row_ending_cell, pad_length
-from switchfit.discretization.rows import ADAPTIVE_ERROR, Tolerances
-from switchfit.engine import adaptive
-from switchfit.engine.adaptive import refine_mesh
-from switchfit.engine.native.engine import native_experiment
-from switchfit.engine.protocol import runs_of
-from switchfit.engine.stiffness import Watch
+from switchfit.discretization import rows, step_size
+from switchfit.discretization.arguments import build_arguments
+from switchfit.discretization.mesh import Mesh, build_rows, find_row_ending_cell, pad_length
+from switchfit.discretization.step_size import Tolerances
+from switchfit.discretization.tableaus import ADAPTIVE_ERROR
+from switchfit.engine.adaptive import integrator
+from switchfit.engine.adaptive import steps as steps_module
+from switchfit.engine.adaptive.stiffness import Watch
+from switchfit.engine.native.native_experiment import native_experiment
+from switchfit.engine.run import runs_of
+from switchfit.meshes.refinement import refine_mesh
 from switchfit.problem.functions import use_float64
 
 # Rows
@@ -141,7 +144,7 @@ def test_both_engines_take_the_steps_of_scipy():
     problem = sf.Problem(system, run)
     coarse = Mesh.of(run)
     native = native_experiment(problem.structures[0], build_arguments(problem, 0, coarse), coarse.times, 0)
-    solve = adaptive._Solve(runs_of(problem)[0], problem.structures[0], coarse, adaptive.Settings())
+    solve = integrator.Integrator(runs_of(problem)[0], problem.structures[0], coarse, integrator.SolveSettings())
     tolerances = Tolerances(problem.rtol, problem.atol)
 
     def steps_of_scipy(mode, start, end, x):
@@ -156,9 +159,9 @@ def test_both_engines_take_the_steps_of_scipy():
     for mode, start, end, x in ((0, 0.0, 1.7, [0.0, 0.0]), (1, 1.7, 2.5, [0.4, 1.0]), (0, 2.9, 6.0, [0.1, -0.2])):
         expected, state = steps_of_scipy(mode, start, end, x)
         with use_float64():
-            stretch = adaptive._Stretch(mode, start, end, np.array(x))
-            natively = adaptive._NativeSteps(native, mode, stretch, np.zeros(0), tolerances)
-            in_python = adaptive._PythonSteps(solve._build_slope(stretch, mode), stretch, tolerances)
+            stretch = steps_module.Stretch(mode, start, end, np.array(x))
+            natively = steps_module.NativeSteps(native, mode, stretch, np.zeros(0), tolerances)
+            in_python = steps_module.PythonSteps(solve._build_slope(stretch, mode), stretch, tolerances)
             found = [solve._take_steps(stretch, steps, Watch()) for steps in (natively, in_python)]
         for steps, after, crossing in found:
             assert crossing is None
@@ -171,13 +174,13 @@ def test_the_last_step_ends_at_the_end_and_one_shorter_than_rounding_is_stuck():
     good, y, tolerances = np.zeros((len(ADAPTIVE_ERROR), 1)), np.zeros(1), Tolerances(1e-8, 1e-9)
 
     def judge_step(t, step, end, slopes):
-        at = rows.Progress(t, step, False, False)
+        at = step_size.Progress(t, step, False, False)
         errors = step * rows.combine(ADAPTIVE_ERROR, slopes)
-        return rows.judge_error(at, end, tolerances, y, y, errors, rows.EXPONENT, np)[0]
+        return step_size.judge_error(at, end, tolerances, y, y, errors, step_size.EXPONENT, np)[0]
 
     with np.errstate(divide="ignore"):
         third, bad = 1.0 / 3.0, good + 1e100
-        assert judge_step(third, rows.limit_step(third, 5.0, 0.7), 0.7, good).t == 0.7
+        assert judge_step(third, step_size.limit_step(third, 5.0, 0.7), 0.7, good).t == 0.7
         assert judge_step(1.0, 3e-15, 2.0, bad).stuck
         assert not judge_step(1.0, 1e-12, 2.0, bad).stuck
         assert judge_step(1.0, np.nan, 2.0, good).stuck

@@ -12,7 +12,7 @@ from models import first_state, one_run, refused, simulate_log
 
 import switchfit as sf
 from benchmarks.modes.truths import random_modes, three_modes
-from switchfit.engine.native.program import _program_of
+from switchfit.engine.native.program_cache import _program_of
 from switchfit.models import heater_problem
 from switchfit.modes import result
 from switchfit.modes.conclusion import list_neighbours

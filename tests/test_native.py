@@ -19,10 +19,13 @@ from models import decay, one_run
 from systems import problem_of
 
 import switchfit as sf
-from switchfit.engine.native import llvm
 from switchfit.engine.native import program as program_module
-from switchfit.engine.native.program import drop_programs
-from switchfit.engine.native.scalars import Graph
+from switchfit.engine.native import program_cache
+from switchfit.engine.native.llvm import compilation
+from switchfit.engine.native.llvm.module import Module
+from switchfit.engine.native.loops import xla_handler
+from switchfit.engine.native.program_cache import drop_programs
+from switchfit.engine.native.scalars.graph import Graph
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 
 # Functions as scalars
@@ -60,15 +63,15 @@ def test_threads_do_not_disturb_one_another():
 
 
 def test_machine_code_is_kept_and_read_again(tmp_path, monkeypatch):
-    module, parse = llvm.Module(2), llvm.llvm.parse_assembly
+    module, parse = Module(2), compilation.llvm.parse_assembly
     module.write_straight_line("f", [("x", 1, Graph().load("x", 0) * 3.0)])
     text = module.take()
 
     def triple(cache, parse=parse):
         monkeypatch.setenv("SWITCHFIT_CACHE", str(cache))
-        monkeypatch.setattr(llvm.llvm, "parse_assembly", parse)
+        monkeypatch.setattr(compilation.llvm, "parse_assembly", parse)
         x = np.array([2.0, 0.0])
-        program = llvm.compile_modules([text])
+        program = compilation.compile_modules([text])
         program.function("f", 1)(x.ctypes.data)
         return x[1]
 
@@ -167,14 +170,18 @@ def test_a_loop_of_unknown_length_is_differentiated_forward(guarded):
 
 
 @pytest.mark.parametrize(
-    ("place", "error"), [("_write", KeyError("add")), ("compile_modules", RuntimeError("LLVM IR parsing error"))]
+    ("module", "place", "error"),
+    [
+        (program_module, "_write", KeyError("add")),
+        (program_cache, "compile_modules", RuntimeError("LLVM IR parsing error")),
+    ],
 )
-def test_a_defect_of_ours_falls_back_and_says_so(place, error, monkeypatch):
+def test_a_defect_of_ours_falls_back_and_says_so(module, place, error, monkeypatch):
     def fails(*_):
         raise error
 
     drop_programs()
-    monkeypatch.setattr(program_module, place, fails)
+    monkeypatch.setattr(module, place, fails)
     engine = sf.estimate(problem_with(decay), max_iterations=1).engine
     assert (engine.name, engine.reason) == ("jax", f"internal: {type(error).__name__}: {error}")
     drop_programs()
@@ -185,7 +192,7 @@ def test_a_program_that_is_compiled_can_be_interrupted(monkeypatch):
     drop_programs()
     monkeypatch.setenv("SWITCHFIT_CACHE", "off")
     waiting, release, done = threading.Event(), threading.Event(), []
-    parse, wait = llvm.llvm.parse_assembly, llvm.wait
+    parse, wait = compilation.llvm.parse_assembly, compilation.wait
 
     def parse_slowly(text):
         release.wait(60.0)
@@ -200,8 +207,8 @@ def test_a_program_that_is_compiled_can_be_interrupted(monkeypatch):
         waiting.wait()
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
-    monkeypatch.setattr(llvm.llvm, "parse_assembly", parse_slowly)
-    monkeypatch.setattr(llvm, "wait", wait_seen)
+    monkeypatch.setattr(compilation.llvm, "parse_assembly", parse_slowly)
+    monkeypatch.setattr(compilation, "wait", wait_seen)
     threading.Thread(target=press_ctrl_c).start()
     with pytest.raises(KeyboardInterrupt):
         Evaluator(problem_of("resets"))
@@ -242,10 +249,10 @@ def test_structs_have_the_fields_of_which_the_offsets_are_known(name, fields):
 
 def test_the_offsets_and_the_version_are_those_of_the_header():
     args, rets = (8 * fields_of(name).index(name.lower()) for name in ("Args", "Rets"))
-    assert 8 * fields_of("CallFrame").index("extension_start") == program_module.EXTENSION
-    assert (5 * 8 + args, 5 * 8 + 5 * 8 + rets) == (program_module.ARGUMENTS, program_module.RESULTS)
+    assert 8 * fields_of("CallFrame").index("extension_start") == xla_handler.FRAME_EXTENSION
+    assert (5 * 8 + args, 5 * 8 + 5 * 8 + rets) == (xla_handler.FRAME_ARGUMENTS, xla_handler.FRAME_RESULTS)
     data, dimensions = (8 * fields_of("Buffer").index(name) for name in ("data", "dims"))
-    assert (data, dimensions) == (program_module.DATA, program_module.DIMENSIONS)
+    assert (data, dimensions) == (xla_handler.BUFFER_DATA, xla_handler.BUFFER_DIMENSIONS)
     major, minor = (int(re.search(rf"#define XLA_FFI_API_{name} (\d+)", HEADER)[1]) for name in ("MAJOR", "MINOR"))
-    assert major == program_module.MAJOR
-    assert minor >= program_module.MINOR
+    assert major == xla_handler.FFI_MAJOR
+    assert minor >= xla_handler.FFI_MINOR

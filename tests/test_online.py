@@ -9,7 +9,7 @@ import pytest
 from models import decay, one_run, simulate_log
 
 import switchfit as sf
-from switchfit.engine.protocol import Hypotheses
+from switchfit.engine.hypotheses import Hypotheses
 from switchfit.models import skid_steer
 from switchfit.online.tracker import Past, Start, forget
 

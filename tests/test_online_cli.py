@@ -16,8 +16,8 @@ from test_cli import catch_settings, run
 from test_cli_modes import PROBLEM, TIMES, fill, simulate, write_log
 
 import switchfit as sf
-from switchfit.io.problem_file import load_problem
-from switchfit.report.html.live import KEPT, LivePage
+from switchfit.cli.live_page import MOST_KEPT_LINES, LivePage
+from switchfit.io.problem_file.loading import load_problem
 from switchfit.runtime.errors import InputError
 
 VALUES = simulate(TIMES, (2.5, 5.5))
@@ -313,11 +313,15 @@ def test_readers_get_what_is_new(page):
     for after, expected in {"3": [3, 4], "5": [], "99": [0, 1, 2, 3, 4], "9" * 5000: [0, 1, 2, 3, 4]}.items():
         lines = json.loads(get(page, f"/now.json?after={after}")[1])["lines"]
         assert [line["k"] for line in lines] == expected
-    for k in range(5, KEPT + 100):
+    for k in range(5, MOST_KEPT_LINES + 100):
         page.show(json.dumps({"k": k}))
     found = json.loads(get(page, "/now.json?after=10")[1])
     assert list(found["head"]["colours"]) == ["rise", "fall", "drift"]
-    assert (found["count"], found["lines"][0]["k"], len(found["lines"])) == (KEPT + 100, 100, KEPT)
+    assert (found["count"], found["lines"][0]["k"], len(found["lines"])) == (
+        MOST_KEPT_LINES + 100,
+        100,
+        MOST_KEPT_LINES,
+    )
 
 
 def test_a_port_that_is_taken(page, folder):

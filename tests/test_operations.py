@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from switchfit.engine.native import llvm
-from switchfit.engine.native.scalars import MAY_FAIL, OPERATIONS, Graph
+from switchfit.engine.native.llvm import compilation
+from switchfit.engine.native.llvm import module as module_module
+from switchfit.engine.native.scalars.graph import Graph
+from switchfit.engine.native.scalars.operations import MAY_FAIL, OPERATIONS
 from switchfit.problem.functions import use_float64
 
 SIZES = [0.0, 0.5, 1.0, 2.5, 2e3, 1e-300, 1e300, np.inf]
@@ -43,10 +45,10 @@ def by_machine_code(operation, points):
     graph = Graph()
     operands = [graph.load("x", k) for k in range(operation.operands)]
     operands = [graph.apply("ne", x, 0.0) if is_truth(operation, k) else x for k, x in enumerate(operands)]
-    module = llvm.Module(1)
+    module = module_module.Module(1)
     module.write_straight_line("f", [("y", 0, applied(graph, operation, operands))])
     assert graph.nodes[-1].op in (operation.name, "select"), "simplified away"
-    program = llvm.compile_modules([module.take()])
+    program = compilation.compile_modules([module.take()])
     function, y = program.function("f", 2), np.zeros(1)
     found = []
     for x in np.ascontiguousarray(points.T):

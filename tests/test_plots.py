@@ -12,9 +12,9 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import switchfit as sf
-from switchfit.io.command_line import write_unknowns
+from switchfit.cli.tables import write_unknowns
 from switchfit.models import heater_problem
-from switchfit.report.style import FIT, TRANSITION, turn_off_formulas
+from switchfit.report.style import FIT_COLOUR, TRANSITION_COLOUR, turn_off_formulas
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
@@ -100,9 +100,9 @@ def test_figures_shade_the_interval_of_the_table():
     (row,) = (row for row in csv.DictReader(write_unknowns(fit).splitlines()) if row["unknown"] == "tau_1")
     table, naive = [float(row["low"]), float(row["high"])], fit.confidence_intervals()[0]
     assert table[1] - table[0] > 1.5 * (naive[1] - naive[0])
-    (band,) = (patch for patch in fit.plot().axes[0].patches if to_hex(patch.get_facecolor()) == TRANSITION)
+    (band,) = (patch for patch in fit.plot().axes[0].patches if to_hex(patch.get_facecolor()) == TRANSITION_COLOUR)
     np.testing.assert_allclose((band.get_x(), band.get_x() + band.get_width()), table)
-    line = next(line for line in fit.plot_timeline().axes[0].lines if to_hex(line.get_color()) == FIT)
+    line = next(line for line in fit.plot_timeline().axes[0].lines if to_hex(line.get_color()) == FIT_COLOUR)
     np.testing.assert_allclose(line.get_xdata(), table)
 
 

@@ -8,7 +8,7 @@ import pytest
 from models import decay, one_run, rest
 
 import switchfit as sf
-from switchfit.engine.native import program
+from switchfit.engine.native import program_cache
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 
 TIMES = np.linspace(0.0, 3.0, 16)
@@ -119,7 +119,7 @@ def test_what_the_papers_equations_do_not_know_is_not_compared_with_them():
 
 
 def programs():
-    return program._program_of.cache_info().misses
+    return program_cache._program_of.cache_info().misses
 
 
 SEQUENCES = {

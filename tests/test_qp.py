@@ -6,10 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optimizer import draw_matrix, solve_qp
 
-from switchfit.optimize import qp
-from switchfit.optimize.matrix import Dense, diagonal_scaling, null_space
-from switchfit.optimize.qp import CholeskyFactor, Room, shift_to_positive, solve_programme
-from switchfit.optimize.state import kkt_residual
+from switchfit.optimize import positive_definite
+from switchfit.optimize.curvature import null_space
+from switchfit.optimize.dense import Dense
+from switchfit.optimize.first_order import kkt_residual
+from switchfit.optimize.positive_definite import CholeskyFactor, shift_to_positive
+from switchfit.optimize.qp import Room, solve_programme
+from switchfit.optimize.symmetric_matrix import diagonal_scaling
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -51,7 +54,7 @@ def test_kkt_conditions_hold(seed, d, k, log_condition):
 
 
 def test_where_daqp_fails_the_step_is_none_and_the_residual_the_whole_gradient(monkeypatch):
-    monkeypatch.setattr(qp.daqp, "solve", lambda *args, **kwargs: (None, None, -4, {}))
+    monkeypatch.setattr("daqp.solve", lambda *args, **kwargs: (None, None, -4, {}))
     g, B, C, c = np.array([1.0, 2.0]), np.diag([1.0, 4.0]), np.eye(2), np.array([-0.5, -0.1])
     assert not solve_qp(g, B, C, c)[0].any()
     assert kkt_residual(g, g, np.eye(2))[0] == pytest.approx(np.sqrt(5.0))
@@ -90,7 +93,7 @@ def test_a_shift_never_lowers_an_eigenvalue_and_the_result_can_be_factorized(low
     shifted, was_positive = shift_to_positive(np.diag([1.0, lowest]))
     assert not was_positive
     assert np.linalg.eigvalsh(shifted)[0] >= max(lowest, 1e-10)
-    qp.CholeskyFactor.of(shifted)
+    positive_definite.CholeskyFactor.of(shifted)
 
 
 @settings(max_examples=60, deadline=None)

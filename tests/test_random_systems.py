@@ -20,10 +20,10 @@ import pytest
 import reference
 
 import switchfit as sf
-from switchfit.discretization.mesh import Stiffness
-from switchfit.engine.adaptive import refine_mesh
-from switchfit.engine.native.program import drop_programs
+from switchfit.discretization.stiffness import Stiffness
+from switchfit.engine.native.program_cache import drop_programs
 from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.refinement import refine_mesh
 
 SYSTEMS = 200
 METHODS = ("discrete-adjoint", "forward", "autodiff", "adjoint")

@@ -7,7 +7,8 @@ import pytest
 from models import decay
 
 import switchfit as sf
-from switchfit.problem.inspection import find_comparisons, find_unread
+from switchfit.problem.comparisons import find_comparisons
+from switchfit.problem.reads import find_unread
 from switchfit.uncertainty.verdict import find_issues
 
 TIMES = np.linspace(0.0, 3.0, 31)

@@ -15,9 +15,9 @@ from models import fit_problem, one_run
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.trajectory import compare
-from switchfit.problem.data import LOSSES, influence, robust
 from switchfit.problem.functions import use_float64
-from switchfit.report.formats import format_rounded
+from switchfit.problem.losses import LOSSES, influence, robust
+from switchfit.report.numbers import format_rounded
 
 
 def free(t, x, p):

@@ -28,7 +28,7 @@ def test_every_key_of_problem_files_is_described_and_in_the_reference(monkeypatc
 
     page = (ROOT / "docs" / "problem-file.md").read_text()
     reference = page + "".join(map(key_pages.build_table, key_pages.SECTIONS))
-    tables = [t for t in vars(keys).values() if isinstance(t, type) and issubclass(t, keys.Table)]
+    tables = [t for t in vars(keys).values() if isinstance(t, type) and issubclass(t, keys.TomlTable)]
     for table in tables:
         described = keys.describe_keys(table)
         for key in table.model_fields:

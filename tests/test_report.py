@@ -16,11 +16,13 @@ import switchfit as sf
 from switchfit.fit.result import Fit, Kink, Step, Termination, compute_scaled_spectrum
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
-from switchfit.problem.unknowns import ActiveConstraint
-from switchfit.report import sentences
-from switchfit.report.formats import format_rounded
-from switchfit.report.plot import plot_comparison, plot_fit, plot_modes, plot_residuals
-from switchfit.runtime.errors import Issue
+from switchfit.problem.constraints import ActiveConstraint
+from switchfit.report import issues, verdict
+from switchfit.report import templates as templates_module
+from switchfit.report.fit_figure import plot_fit
+from switchfit.report.numbers import format_rounded
+from switchfit.report.panels import plot_comparison, plot_modes, plot_residuals
+from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.verdict import find_issues
 
 
@@ -397,10 +399,10 @@ def test_fields_of_sentences_are_words_or_figures():
     sources = (path for path in library.rglob("*.py") if "report" not in path.parts)
     nodes = itertools.chain.from_iterable(ast.walk(ast.parse(path.read_text())) for path in sources)
     known = {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    templates = [text for text in (*sentences._ISSUES.values(), *sentences._REASONS.values()) if isinstance(text, str)]
+    templates = [text for text in (*issues._ISSUES.values(), *verdict.REASONS.values()) if isinstance(text, str)]
     found = {field for text in templates for _, field, *_ in Formatter().parse(text) if field}
     assert len(found) > 20
-    assert {field for field in found if not field.isdigit()} <= sentences._WORDS.keys() | known
+    assert {field for field in found if not field.isdigit()} <= templates_module._WORDS.keys() | known
 
 
 if __name__ == "__main__":

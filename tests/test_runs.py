@@ -12,7 +12,7 @@ from models import refused
 
 import switchfit as sf
 from switchfit.batch.program import Inputs, Layout
-from switchfit.engine.native.program import _program_of
+from switchfit.engine.native.program_cache import _program_of
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.problem.functions import Call, trace_function
 from switchfit.strategy.beam import follow_order

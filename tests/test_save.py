@@ -17,9 +17,9 @@ import switchfit as sf
 from switchfit.estimation.estimator import FORMAT, VERSION, Estimate, save_fit
 from switchfit.fit.result import Fit, Kink
 from switchfit.optimize import Status
-from switchfit.problem.unknowns import ActiveConstraint
-from switchfit.runtime.errors import Issue
-from switchfit.runtime.files import find_dtype
+from switchfit.problem.constraints import ActiveConstraint
+from switchfit.runtime.issue import Issue
+from switchfit.runtime.json_records import find_dtype
 from switchfit.uncertainty.certificate import Certificate
 
 CERTIFICATE = Certificate(

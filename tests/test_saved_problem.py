@@ -11,9 +11,9 @@ import pytest
 from test_cli import PROBLEM, ROOM, log_of, run
 
 import switchfit as sf
+from switchfit.cli.saved_estimates import list_changed_models, load_with_problem
 from switchfit.estimation.estimator import Provenance
-from switchfit.io.command_line import list_changed_models, load_with_problem
-from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.loading import load_problem
 from switchfit.models import heater_problem
 from switchfit.runtime.errors import InputError
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from optimizer import box, draw_matrix, free, minimize, rows
 
 from switchfit.optimize import Status
-from switchfit.optimize.state import kkt_residual
+from switchfit.optimize.first_order import kkt_residual
 
 SEEDS = st.integers(0, 2**32 - 1)
 

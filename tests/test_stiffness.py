@@ -12,11 +12,12 @@ from test_implicit import SQUARE, robertson, van_der_pol
 from test_implicit import one_mode as stiff_mode
 
 import switchfit as sf
-from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
-from switchfit.engine.protocol import runs_of
-from switchfit.engine.stiffness import Choice, Look, Watch
+from switchfit.engine.adaptive.stiffness import Look, Watch
+from switchfit.engine.run import runs_of
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.report.text import write_steps
+from switchfit.meshes.implicit_modes import ImplicitModes
+from switchfit.meshes.refinement import refine_if_unstable, refine_mesh
+from switchfit.report.problem import write_steps
 
 
 def relax(t, x, p):
@@ -66,8 +67,8 @@ def test_robertsons_problem_agrees_with_scipy():
 
 
 def test_the_explicit_solve_is_given_up_once_it_is_clear_that_stability_limits_it(monkeypatch):
-    watches, watch = [], Choice.watch
-    monkeypatch.setattr(Choice, "watch", lambda choice, k: watches.append(watch(choice, k)) or watches[-1])
+    watches, watch = [], ImplicitModes.watch
+    monkeypatch.setattr(ImplicitModes, "watch", lambda choice, k: watches.append(watch(choice, k)) or watches[-1])
     problem = relaxing(1e4)
     refine_mesh(problem, 0, problem.initial_theta)
     assert watches[0].modes["m"].count <= 20 * 256

@@ -21,11 +21,11 @@ from test_save import CERTIFICATE, assert_same
 import switchfit as sf
 from switchfit.batch import fits as saved
 from switchfit.batch.chunks import compute_seal
+from switchfit.cli.tables import write_runs, write_unknowns
 from switchfit.fit.result import Fit
-from switchfit.io.command_line import write_runs, write_unknowns
 from switchfit.models import heater_problem
-from switchfit.problem.unknowns import ActiveConstraint
-from switchfit.runtime.errors import MissingExtraError
+from switchfit.problem.constraints import ActiveConstraint
+from switchfit.runtime.extras import MissingExtraError
 from switchfit.uncertainty.residuals import correct_intervals
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")

@@ -15,7 +15,7 @@ from test_report import write_report as report
 
 import switchfit as sf
 from benchmarks import vehicle_coverage
-from switchfit.engine.protocol import Evaluation
+from switchfit.engine.evaluation import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import disagreement, free_kinks, measure_kink_variance
 from switchfit.models import heater_problem, lugre

@@ -12,8 +12,8 @@ from test_cli import run as invoke
 from test_io import PROBLEM, ROOM
 
 import switchfit as sf
-from switchfit.io.problem_file import load_problem
-from switchfit.report.text import write_problem
+from switchfit.io.problem_file.loading import load_problem
+from switchfit.report.problem import write_problem
 from switchfit.uncertainty import certificate
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")

@@ -9,10 +9,10 @@ import scipy.stats
 from models import approach
 
 import switchfit as sf
-from switchfit.io.command_line import summarize_validation
+from switchfit.cli.summaries import summarize_validation
 from switchfit.models import heater_problem
-from switchfit.problem.data import robust
-from switchfit.report.formats import format_rounded
+from switchfit.problem.losses import robust
+from switchfit.report.numbers import format_rounded
 from switchfit.strategy.comparison import compute_log_norm
 from switchfit.strategy.validation import correlate
 

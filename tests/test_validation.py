@@ -15,18 +15,11 @@ from hypothesis.extra.numpy import arrays
 from models import decay, first_state, refused
 
 import switchfit as sf
-from switchfit.problem.validation import (
-    LONGEST,
-    as_array,
-    as_callable,
-    as_choice,
-    as_count,
-    as_path,
-    as_sequence,
-    join_names,
-    refuse_single_precision,
-    shorten,
-)
+from switchfit.problem.validation.arrays import as_array, as_count
+from switchfit.problem.validation.messages import LONGEST_SHOWN_VALUE, join_names, shorten
+from switchfit.problem.validation.names import as_choice, as_sequence
+from switchfit.problem.validation.objects import as_callable, as_path
+from switchfit.problem.validation.precision import refuse_single_precision
 
 # Single precision
 
@@ -175,7 +168,7 @@ WITHOUT_TEXT = type("WithoutText", (), {"__repr__": lambda self: 1 / 0})()
 @pytest.mark.parametrize("value", [*LONG, WITHOUT_TEXT, PROBLEM], ids=lambda value: type(value).__name__)
 def test_what_messages_show_is_short(value):
     began = time.perf_counter()
-    assert 0 < len(shorten(value)) <= LONGEST
+    assert 0 < len(shorten(value)) <= LONGEST_SHOWN_VALUE
     assert time.perf_counter() - began < 0.5
     assert join_names(str(k) for k in range(1000)).endswith("9 and 990 more")
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from switchfit.models import bicycle, differential_drive, rolling_body, skid_steer
-from switchfit.models.skid_steer import STUCK
+from switchfit.models.skid_steer import STUCK_AXLES
 
 G = 9.81
 
@@ -128,7 +128,7 @@ def dissipate(q, dq, mode, drag):
     along = in_body(dq[:2], q)[0]
     found += WEIGHT * GROUND["rho"] * jnp.sqrt(along**2 + SMALL**2)
     for side, viscous, coulomb in ((1, "mf", "kf"), (-1, "mr", "kr")):
-        if side not in STUCK[mode]:
+        if side not in STUCK_AXLES[mode]:
             v = lateral_speed(side, q, dq)
             found += WEIGHT / 2 * (GROUND[viscous] * v**2 / 2 + GROUND[coulomb] * jnp.sqrt(v**2 + SMALL**2))
     return found
@@ -141,7 +141,7 @@ def lift(q):
 
 def hold(mode):
     """Lateral speeds of the axles that stick."""
-    return lambda q, dq: jnp.stack([lateral_speed(side, q, dq) for side in STUCK[mode]])
+    return lambda q, dq: jnp.stack([lateral_speed(side, q, dq) for side in STUCK_AXLES[mode]])
 
 
 @cache
@@ -152,7 +152,7 @@ def slopes_of_hold(mode):
 
 def admit(mode, q, dq):
     """The part of a velocity that the axles which stick admit."""
-    if not STUCK[mode]:
+    if not STUCK_AXLES[mode]:
         return dq
     A = np.asarray(slopes_of_hold(mode)(q, dq))
     return dq - np.linalg.pinv(A) @ A @ dq
@@ -161,10 +161,10 @@ def admit(mode, q, dq):
 def make_skid_steer(**settings):
     names = {"mu_front": "mf", "mu_rear": "mr", "coulomb_front": "kf", "coulomb_rear": "kr"}
     grounds = {"rolling": "rho", "slope_x": "sx", "slope_y": "sy", "small_speed": SMALL}
-    return skid_steer(modes=tuple(STUCK), restick="reset", **names, **grounds, **settings)
+    return skid_steer(modes=tuple(STUCK_AXLES), restick="reset", **names, **grounds, **settings)
 
 
-@pytest.mark.parametrize("mode", STUCK)
+@pytest.mark.parametrize("mode", STUCK_AXLES)
 def test_skid_steer_follows_from_its_energies(mode):
     field = make_skid_steer(forces_from_input=True).modes[mode]
     random = np.random.default_rng(5)
@@ -174,7 +174,7 @@ def test_skid_steer_follows_from_its_energies(mode):
         ahead = jnp.array([jnp.cos(q[2]), jnp.sin(q[2])])
         Q = jax.vmap(lambda wheel, F: work_of(wheel, F * ahead, q))(jnp.array(WHEELS), forces).sum(0)
         Q = Q - jax.grad(dissipate, argnums=1)(q, dq, mode, 0.72 if mode == "stick" else 0.92) - jax.grad(lift)(q)
-        return balance(MASSES, q, dq, Q, hold(mode) if STUCK[mode] else None)
+        return balance(MASSES, q, dq, Q, hold(mode) if STUCK_AXLES[mode] else None)
 
     for _ in range(5):
         q = jnp.array(random.uniform(-3, 3, 3))

@@ -13,7 +13,7 @@ import switchfit as sf
 from benchmarks import vehicle_coverage
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import bicycle, differential_drive, lugre, magic_formula, skid_steer, sliding_block
-from switchfit.models.magic_formula import (
+from switchfit.models.tyre_forces import (
     ALIGNING_MOMENT,
     MAGIC_FORMULA,
     _curve,

@@ -10,7 +10,7 @@ from models import STILL, curve, fishing, fit_problem, heated_room, linear, one_
 import switchfit as sf
 from benchmarks.starts.problems import build_case
 from switchfit.fit.result import Step
-from switchfit.report.sentences import format_share
+from switchfit.report.shares import format_share
 from switchfit.uncertainty.residuals import compare_with_sigma
 from switchfit.uncertainty.verdict import Numbers, find_doubts
 

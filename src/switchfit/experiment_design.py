@@ -43,24 +43,29 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.mesh import Arguments, build_arguments, split_by_cell
+from switchfit.discretization.arguments import Arguments, build_arguments, split_by_cell
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import propagate, see_samples
-from switchfit.engine.branches import has_corners
+from switchfit.discretization.propagation import propagate
+from switchfit.discretization.sampled_states import see_samples
 from switchfit.engine.choice import engine_of
+from switchfit.engine.corners.branches import has_corners
 from switchfit.fit.evaluator import Evaluator, find_free_directions, place_on_guards
 from switchfit.fit.result import inverse_on
 from switchfit.fit.trajectory import Trajectory, compare, simulate
 from switchfit.optimize.threads import one_thread
-from switchfit.problem import validation
-from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.functions import use_float64
+from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation import as_count, as_names, as_positive, join_names, shorten
+from switchfit.problem.validation import arrays, objects
+from switchfit.problem.validation import names as names_module
+from switchfit.problem.validation.arrays import FloatArray, as_count, as_positive
+from switchfit.problem.validation.messages import join_names, shorten
+from switchfit.problem.validation.names import as_names
 from switchfit.runtime.cache import use_compilation_cache
-from switchfit.runtime.files import to_json, write_document
+from switchfit.runtime.json_documents import write_document
+from switchfit.runtime.json_records import to_json
 from switchfit.runtime.presentation import Figure, Printed, draw_figure, format_line, join_first
 
 POWERS = {"D": 0.0, "A": 1.0, "E": 1e3}
@@ -75,6 +80,21 @@ RIDGE = 1e-12
 SIDES = (1, -1)
 """Sensitivities jump where a transition time is at a sample or a knot of an input: the information is the mean of both
 sides, since the true time may be on either."""
+
+GAIN = 1e-9
+"""An exchange must lower log m by more: equal candidates would be exchanged for ever."""
+
+UNUSABLE = 1e3
+"""log m of a design whose trajectory cannot be integrated."""
+
+ROUNDS = 6
+"""Most turns of inputs, mesh and samples."""
+
+ENOUGH = 1e-4
+"""The turns end where log m falls by less."""
+
+MOST_SENSORS = 12
+"""Sensors of which all sets are looked at."""
 
 
 class Criterion(NamedTuple):
@@ -131,10 +151,6 @@ class Criterion(NamedTuple):
             return np.inf
         values = np.linalg.eigvalsh(C)
         return float({"D": np.log(values).sum, "A": values.sum, "E": values.max}[kind]())
-
-
-GAIN = 1e-9
-"""An exchange must lower log m by more: equal candidates would be exchanged for ever."""
 
 
 class Candidates(NamedTuple):
@@ -306,10 +322,6 @@ def _see(model: Model, side: Array, theta: Array) -> tuple[list[tuple[Array, Arr
     return found, weights
 
 
-UNUSABLE = 1e3
-"""log m of a design whose trajectory cannot be integrated."""
-
-
 def name_inputs(run: Experiment) -> tuple[str, ...]:
     """Return what the entries of the input of a run are called: by their names, or u, or u[0], u[1], ...
 
@@ -366,7 +378,7 @@ def read_limits(run: Experiment, free: Mapping[str, Any]) -> tuple[FloatArray, F
         if not columns:
             raise ValueError(f"free must name inputs of the run: {join_names(names)}; got {shorten(name)}.")
         try:
-            pair = np.stack([np.broadcast_to(validation.as_array(limit, name), len(ends[0])) for limit in limits])
+            pair = np.stack([np.broadcast_to(arrays.as_array(limit, name), len(ends[0])) for limit in limits])
         except (TypeError, ValueError):
             pair = np.full((2, 1), np.nan)
         if pair.shape[0] != 2 or not np.isfinite(pair).all() or np.any(pair[0] > pair[1]):
@@ -590,17 +602,7 @@ class Design(DesignRecord, Printed):
         ['tau_1', 'k']
         """
         content = {"format": "switchfit design", "version": 1, "design": to_json(self, DesignRecord)}
-        write_document(content, validation.as_path(path, "path"))
-
-
-ROUNDS = 6
-"""Most turns of inputs, mesh and samples."""
-
-ENOUGH = 1e-4
-"""The turns end where log m falls by less."""
-
-MOST_SENSORS = 12
-"""Sensors of which all sets are looked at."""
+        write_document(content, objects.as_path(path, "path"))
 
 
 @one_thread()
@@ -687,12 +689,12 @@ def design(
     (array([0.02 , 0.008]), array([0.027, 0.014]))
     """
     began = time.perf_counter()
-    validation.as_instance(problem, "problem", Problem, "an sf.Problem")
+    objects.as_instance(problem, "problem", Problem, "an sf.Problem")
     require_estimable(problem)
     last = len(problem.experiments) - 1
-    e = last if experiment is None else validation.as_index(experiment, "experiment", last + 1)
-    nominal, kind = problem.check_theta(theta), validation.as_choice(criterion, "criterion", tuple(POWERS))
-    starts, seed = as_count(starts, "starts"), validation.as_seed(seed)
+    e = last if experiment is None else arrays.as_index(experiment, "experiment", last + 1)
+    nominal, kind = problem.check_theta(theta), names_module.as_choice(criterion, "criterion", tuple(POWERS))
+    starts, seed = as_count(starts, "starts"), arrays.as_seed(seed)
     _check_data(problem)
     run, (chosen, scales) = problem.experiments[e], _find_chosen(problem, names)
     labels = name_sensors(run)

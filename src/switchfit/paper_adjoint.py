@@ -1,4 +1,4 @@
-r"""The paper's derivatives, equations (6)-(17): optimize, then discretize.
+"""The paper's derivatives, equations (6)-(17): optimize, then discretize.
 
 Reference: L. M. Miller and T. D. Murphey, sections III and IV. Equation numbers at the lines are the paper's, and so
 are the names: ``f``, ``X`` (the jump X^i of the vector field), ``psi``, ``Omega``, ``Omega_p``, ``Phi``, ``Dp_x``,
@@ -59,22 +59,19 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from switchfit.discretization.mesh import Arguments, Samples, find_row_ending_cell
-from switchfit.discretization.model import Field, Model, Piece
-from switchfit.discretization.propagation import (
-    Path,
-    compute_path_cost,
-    find_late_rows,
-    pick_at_cells,
-    propagate,
-    step_to_late_sample,
-    switch_method,
-    switch_mode,
-)
-from switchfit.discretization.rows import Tableau, combine
+from switchfit.discretization.arguments import Arguments, Samples
+from switchfit.discretization.mesh import find_row_ending_cell
+from switchfit.discretization.model import Field, Model
+from switchfit.discretization.path_costs import compute_path_cost
+from switchfit.discretization.propagation import Path, pick_at_cells, propagate, switch_method, switch_mode
+from switchfit.discretization.rows import combine
+from switchfit.discretization.sampled_states import find_late_rows, step_to_late_sample
+from switchfit.discretization.signals import Piece
+from switchfit.discretization.tableaus import Tableau
 from switchfit.problem.structure import Structure
 
 Array = jax.Array
+Function = Callable[[Array, Array, Array], Array]
 
 
 class Sensitivities(NamedTuple):
@@ -544,9 +541,6 @@ def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, giv
             slopes.append(slope(at_stage, flat if inside is None else flat + h * inside))
         K = jnp.stack(slopes)
     return jax.vmap(unravel)(flat[None] + h * (a @ K)), unravel(flat + h * (b @ K))
-
-
-Function = Callable[[Array, Array, Array], Array]
 
 
 def differentiate(function: Function, t: Array, x: Array, p: Array) -> Slopes:

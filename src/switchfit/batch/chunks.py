@@ -26,18 +26,18 @@ from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import write_atomically
 from switchfit.runtime.progress import Progress
 
-
-def count_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 Arrays = dict[str, NDArray[Any]]
+
 RETRIES = 3
 """Times a chunk is tried again on a Dask cluster after an error."""
 
 MANY = 8
 """Chunks a core from which there is one thread more than cores."""
+
+
+def count_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_chunks(

@@ -31,15 +31,16 @@ from switchfit.batch.program import Ends
 from switchfit.estimation.estimator import Estimate, parse_fit, write_fit
 from switchfit.fit.result import count_samples, interval, measure_quantile, measure_variance
 from switchfit.optimize import Status
-from switchfit.problem.data import FloatArray
-from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import Experiment
+from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_level, as_path
+from switchfit.problem.validation.arrays import FloatArray, as_level
+from switchfit.problem.validation.objects import as_path
 from switchfit.runtime import special
-from switchfit.runtime.errors import Issue
-from switchfit.runtime.files import find_dtype, from_json, parse_document, to_json
 from switchfit.runtime.frames import Tabular
+from switchfit.runtime.issue import Issue
+from switchfit.runtime.json_documents import parse_document
+from switchfit.runtime.json_records import find_dtype, from_json, to_json
 from switchfit.runtime.presentation import Displayed, Figure, draw_figure, format_line, join_first
 from switchfit.uncertainty import verdict
 from switchfit.uncertainty.certificate import certify
@@ -49,6 +50,24 @@ from switchfit.uncertainty.walks import replace_intervals
 
 FORMAT = "switchfit fits"
 VERSION = 3
+
+AT_END = 1e-9
+"""Duration of a mode, as a part of the horizon, or distance from a bound, as a part of it, that counts as zero."""
+
+MINOR = 0.01
+"""Share of a study's fits that may have failed, or ended at a bound or with a collapsed mode, without a doubt about its
+standard deviations and 95 % intervals."""
+
+FAR_AWAY = 10.0
+"""Robust standard deviations (1.48 times the median deviation) from the median beyond which a fit of a study has ended
+in another minimum. The tails of noise do not reach that far; a single fit that does shows in standard deviations."""
+
+EXPLAINED_BADLY = ("unexplained", "no noise")
+"""Doubts that chi-square gives."""
+
+LEVEL = 0.95
+"""Level at which a study's intervals are checked against the truth. It is said if they miss it half as often again as
+they should (`HALF`), and chance does not explain it."""
 
 
 def _split_fields(kind: type[Any]) -> tuple[list[str], type[Any]]:
@@ -348,10 +367,6 @@ class Fits(Ends, Tabular, Displayed):
             raise ValueError(f"{file} is damaged: {error}.") from error
 
 
-AT_END = 1e-9
-"""Duration of a mode, as a part of the horizon, or distance from a bound, as a part of it, that counts as zero."""
-
-
 def describe_ends(
     problem: Problem, theta: FloatArray, cost: FloatArray, variation: FloatArray
 ) -> dict[str, NDArray[Any]]:
@@ -388,22 +403,6 @@ def _count_collapsed(problem: Problem, experiment: Experiment, ends: FloatArray)
     shortest = least + AT_END * (experiment.end - experiment.t0)
     found: NDArray[np.int64] = np.sum(np.diff(ends, axis=1) <= shortest, axis=1)
     return found
-
-
-MINOR = 0.01
-"""Share of a study's fits that may have failed, or ended at a bound or with a collapsed mode, without a doubt about its
-standard deviations and 95 % intervals."""
-
-FAR_AWAY = 10.0
-"""Robust standard deviations (1.48 times the median deviation) from the median beyond which a fit of a study has ended
-in another minimum. The tails of noise do not reach that far; a single fit that does shows in standard deviations."""
-
-EXPLAINED_BADLY = ("unexplained", "no noise")
-"""Doubts that chi-square gives."""
-
-LEVEL = 0.95
-"""Level at which a study's intervals are checked against the truth. It is said if they miss it half as often again as
-they should (`HALF`), and chance does not explain it."""
 
 
 def has_converged(status: NDArray[Any]) -> NDArray[np.bool_]:

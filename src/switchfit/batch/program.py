@@ -32,25 +32,28 @@ import numpy as np
 from jax import lax
 from numpy.typing import NDArray
 
-from switchfit.discretization.mesh import Arguments, Mesh
-from switchfit.engine.branches import has_corners
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import derivatives_inside_program, runs_natively
-from switchfit.engine.native.engine import places_in_library
+from switchfit.engine.corners.branches import has_corners
+from switchfit.engine.native.library_places import places_in_library
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Fit, Kink, Termination, free_kinks, inverse_on, list_kinks, termination_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Result, Status
-from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, Task, minimize_traced
-from switchfit.problem.data import FloatArray
+from switchfit.optimize.traced_constraints import TracedBreakpoints, TracedConstraints
+from switchfit.optimize.traced_sqp import minimize_traced
+from switchfit.optimize.traced_state import Outcome, TracedProblem
 from switchfit.problem.functions import use_float64
-from switchfit.problem.parameter import PriorTerms
+from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
-from switchfit.problem.unknowns import Variables
+from switchfit.problem.validation.arrays import FloatArray
+from switchfit.problem.variables import Variables
 from switchfit.runtime.cache import use_compilation_cache
-from switchfit.runtime.errors import Issue
+from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.walks import Derivatives
 
 CHUNK = 128
@@ -67,9 +70,28 @@ some of them to other threads takes an eighth of the time of all fits."""
 
 compile_for_layout = partial(jax.jit, static_argnames=("layout",), compiler_options=ONE_BY_ONE)
 
-
 Varying = Mapping[int, Any]
 """What differs from fit to fit: values (R, ...) of leaves of all `Arguments`, by their places in JAX's order."""
+
+_known: set[Any] = set()
+_lock, _gpu = threading.Lock(), threading.Lock()
+
+EVALUATIONS = 256
+"""Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
+
+UNDEFINED = (ValueError, ArithmeticError, np.linalg.LinAlgError)
+"""What a model raises where it is undefined."""
+
+LONGEST_ERROR = 500
+"""Characters of an error that are listed."""
+
+RAISED = re.compile(r"\s*[\w.]+(Error|Exception): ")
+"""The line of a traceback that names an exception."""
+
+_NO_PROGRAM = (
+    "The compiled program of many fits failed ({error}); they are done one by one, which takes much longer. This is an "
+    "error in switchfit itself: please report it."
+)
 
 
 @dataclass(frozen=True)
@@ -145,7 +167,7 @@ class Inputs(NamedTuple):
     variables: Variables
     lower: Any
     upper: Any
-    constraints: Constraints
+    constraints: TracedConstraints
 
     @classmethod
     def of(cls, evaluator: Evaluator, layout: Layout) -> Inputs:
@@ -157,7 +179,7 @@ class Inputs(NamedTuple):
         limits: list[Any] = [variables.inward(unknowns.lower), variables.inward(unknowns.upper)]
         rows: list[Any] = [unknowns.A, unknowns.b, *limits, variables.sizes_inward(problem.sizes)]
         of_theta = unknowns.priors, variables, unknowns.lower, unknowns.upper
-        return cls(tuple(evaluator.arguments), times, sequences, *of_theta, Constraints(*rows))
+        return cls(tuple(evaluator.arguments), times, sequences, *of_theta, TracedConstraints(*rows))
 
     def find_theta(self, z: Any) -> Any:
         """Return theta (d,) at z, the variables of the optimiser."""
@@ -216,10 +238,6 @@ def _group_experiments(layout: Layout, arguments: tuple[Arguments, ...], inputs:
     return list(groups.values())
 
 
-_known: set[Any] = set()
-_lock, _gpu = threading.Lock(), threading.Lock()
-
-
 @contextmanager
 def compile_once(layout: Layout, given: Any) -> Iterator[None]:
     """Compile the program in the first call that needs it, using the compilation cache; other threads wait."""
@@ -237,19 +255,6 @@ def pad_fits(values: Any, size: int) -> FloatArray:
     """Repeat the last of `values` (R, ...) up to `size`: the number of fits must not shape the program."""
     array = np.asarray(values)
     return np.concatenate([array, np.repeat(array[-1:], size - len(array), axis=0)]) if len(array) < size else array
-
-
-EVALUATIONS = 256
-"""Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
-
-UNDEFINED = (ValueError, ArithmeticError, np.linalg.LinAlgError)
-"""What a model raises where it is undefined."""
-
-LONGEST_ERROR = 500
-"""Characters of an error that are listed."""
-
-RAISED = re.compile(r"\s*[\w.]+(Error|Exception): ")
-"""The line of a traceback that names an exception."""
 
 
 class Limits(NamedTuple):
@@ -534,7 +539,7 @@ def _minimize_fits(
             return J, *variables.derivatives_inward(theta, g, H, jnp)
 
         breakpoints = _list_breakpoints(layout, inputs.times, replace_leaves(inputs.arguments, layout.varying, own))
-        found = minimize_traced(Task(evaluate, inputs.constraints, breakpoints, *limits), start)
+        found = minimize_traced(TracedProblem(evaluate, inputs.constraints, breakpoints, *limits), start)
         theta = inputs.find_theta(found.theta)
         left = variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
         gradient, hessian = variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
@@ -573,7 +578,7 @@ def _evaluate_fits(
     return lax.fori_loop(0, count, one, empty)
 
 
-def _list_breakpoints(layout: Layout, times: tuple[Any, ...], arguments: tuple[Arguments, ...]) -> Breakpoints:
+def _list_breakpoints(layout: Layout, times: tuple[Any, ...], arguments: tuple[Arguments, ...]) -> TracedBreakpoints:
     """Return the nodes of each free transition time; these are not scaled."""
     nodes = {
         place: own.nodes
@@ -582,16 +587,10 @@ def _list_breakpoints(layout: Layout, times: tuple[Any, ...], arguments: tuple[A
         if place >= 0
     }
     if not nodes:
-        return Breakpoints(np.zeros(0, np.intp), jnp.zeros((0, 1)))
+        return TracedBreakpoints(np.zeros(0, np.intp), jnp.zeros((0, 1)))
     longest = max(len(a) for a in nodes.values())
     padded = [jnp.pad(a, (0, longest - len(a)), constant_values=jnp.inf) for a in nodes.values()]
-    return Breakpoints(np.array(list(nodes)), jnp.stack(padded))
-
-
-_NO_PROGRAM = (
-    "The compiled program of many fits failed ({error}); they are done one by one, which takes much longer. This is an "
-    "error in switchfit itself: please report it."
-)
+    return TracedBreakpoints(np.array(list(nodes)), jnp.stack(padded))
 
 
 def _is_raised_in_callback(error: BaseException) -> bool:

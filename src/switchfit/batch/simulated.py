@@ -50,15 +50,24 @@ from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, measure_variation, place_on_guards
 from switchfit.fit.result import inverse_on
 from switchfit.fit.trajectory import compare, replace_values
-from switchfit.problem import validation
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem, require_estimable
-from switchfit.problem.validation import as_array, as_count, as_seed, shorten
+from switchfit.problem.validation import arrays, names, objects
+from switchfit.problem.validation.arrays import FloatArray, as_array, as_count, as_seed
+from switchfit.problem.validation.messages import shorten
 from switchfit.runtime import special
 from switchfit.uncertainty.prediction import collect_sample_derivatives
 from switchfit.uncertainty.verdict import Verdict
 
 Noise = float | ArrayLike | Callable[[np.random.Generator, FloatArray, Any], ArrayLike] | None
+
+Values = dict[tuple[int, int], FloatArray]
+"""Values of data that are simulated, by the experiment and the place among its data: (K, q), or (R, K, q) of R runs."""
+
+Resample = Literal["residuals", "wild", "blocks", "runs"]
+
+LEFT_OUT = 1e-8
+"""Weight of a run that was not drawn: its own transition times stay determined, and nothing else depends on it."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -206,7 +215,7 @@ def monte_carlo(
     >>> len(study), bool((study.standard_deviation < 0.05).all())
     (20, True)
     """
-    validation.as_instance(problem, "problem", Problem, "an sf.Problem")
+    objects.as_instance(problem, "problem", Problem, "an sf.Problem")
     require_estimable(problem)
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
     how = LongRun.check(tolerance, max_iterations, client, folder, callback)
@@ -227,7 +236,7 @@ def _check_noise(noise: Noise) -> Noise:
     if noise is None:
         return None
     if callable(noise):
-        return validation.as_callable(noise, "noise", "a function noise(rng, clean, item)", arguments=3)
+        return objects.as_callable(noise, "noise", "a function noise(rng, clean, item)", arguments=3)
     return as_array(noise, "noise", form="a number, one for each channel, or a function")
 
 
@@ -248,10 +257,6 @@ def build_study(
     study = SimulatedStudy(problem, [], begin[None], limits, seed, drawn, clean)
     study.meshes, error = _build_meshes(study.problem_of(0), truth, begin)
     return study, error
-
-
-Values = dict[tuple[int, int], FloatArray]
-"""Values of data that are simulated, by the experiment and the place among its data: (K, q), or (R, K, q) of R runs."""
 
 
 def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
@@ -368,12 +373,6 @@ class SimulatedStudy(Study):
         return changed
 
 
-Resample = Literal["residuals", "wild", "blocks", "runs"]
-
-LEFT_OUT = 1e-8
-"""Weight of a run that was not drawn: its own transition times stay determined, and nothing else depends on it."""
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Bootstrap(Fits):
     """Result of `bootstrap`: everything in `Fits`, and what it belongs to. Print it for the table.
@@ -456,7 +455,7 @@ class Bootstrap(Fits):
         >>> bool((low < high).all())
         True
         """
-        level = validation.as_level(level)
+        level = arrays.as_level(level)
         theta = self.theta[self.success]
         found = np.full((len(self.estimate), 2), np.nan)
         if len(theta) < 2:
@@ -529,7 +528,7 @@ def bootstrap(
     """
     if not isinstance(estimate, Estimate):
         raise TypeError(f"bootstrap needs the result of sf.estimate; got {type(estimate).__name__}.")
-    resample = validation.as_choice(resample, "resample", get_args(Resample))
+    resample = names.as_choice(resample, "resample", get_args(Resample))
     if block is not None and resample != "blocks":
         raise ValueError(f"block is the length of blocks: give it with resample='blocks', not with {resample!r}.")
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)

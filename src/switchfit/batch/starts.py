@@ -20,9 +20,9 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.optimize import Status
-from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_estimable
-from switchfit.problem.validation import as_array, as_count, as_instance, as_seed
+from switchfit.problem.validation.arrays import FloatArray, as_array, as_count, as_seed
+from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.presentation import Drawn, draw_figure
 from switchfit.strategy.starts import MOST_DRAWN, draw_starts

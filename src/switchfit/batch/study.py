@@ -32,19 +32,22 @@ from switchfit.batch import fits as judged
 from switchfit.batch.chunks import Arrays, compute_fingerprint, run_chunks
 from switchfit.batch.fits import Fits, has_converged
 from switchfit.batch.program import Batch, Chunk, Limits, Varying, choose_chunk_size, describe_failure
-from switchfit.discretization.mesh import Mesh, build_arguments
-from switchfit.engine.branches import has_corners
+from switchfit.discretization.arguments import build_arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.corners.branches import has_corners
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, measure_variation
 from switchfit.fit.result import count_priors, count_samples, measure_quantile, measure_variance
 from switchfit.fit.solution import refuse_hidden_switches
 from switchfit.optimize import Status
-from switchfit.optimize.traced import Outcome
-from switchfit.problem.data import FloatArray
-from switchfit.problem.dates import Origin
+from switchfit.optimize.traced_state import Outcome
+from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem, require_estimable
-from switchfit.problem.validation import as_callable, as_instance, as_path, as_sequence, join_names
+from switchfit.problem.validation.arrays import FloatArray
+from switchfit.problem.validation.messages import join_names
+from switchfit.problem.validation.names import as_sequence
+from switchfit.problem.validation.objects import as_callable, as_instance, as_path
 from switchfit.runtime.progress import show_progress
 from switchfit.strategy.starts import End, fit_briefly
 from switchfit.uncertainty import walks as ways
@@ -58,6 +61,9 @@ MOST_KEPT = MOST_SAMPLES + 1 + ways.MOST_HALVINGS
 """Pieces that are kept for one side."""
 
 AT_KINK = Status.CONVERGED_AT_KINK.name
+
+CHUNK_FORMAT = "fits 4"
+"""Part of every fingerprint: it changes where the arrays of a chunk do, so that folders of before are not used."""
 
 
 def list_places(problem: Problem) -> NDArray[np.intp]:
@@ -157,10 +163,6 @@ def _is_resolved(problem: Problem, meshes: Sequence[Mesh] | None, theta: FloatAr
     fine = evaluator.halve_rows(theta).cost(theta)
     error = cost_error(problem, fine, cost if meshes is None else evaluator.cost(theta), 0.0)
     return error <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
-
-
-CHUNK_FORMAT = "fits 4"
-"""Part of every fingerprint: it changes where the arrays of a chunk do, so that folders of before are not used."""
 
 
 @dataclass

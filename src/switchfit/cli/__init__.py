@@ -1,4 +1,4 @@
-"""The command line: a module for each group of commands, ``switchfit --help`` for the list.
+"""The command line: a module for each command, ``switchfit --help`` for the list.
 
 Exit codes: 0 converged and the verdict is good or doubtful, 1 not converged or bad (the result is still written),
 2 wrong input, 3 an error of switchfit itself, 130 interrupted by Ctrl-C. Only typer is imported here; the numerical
@@ -20,14 +20,20 @@ YOUNG_OBJECTS = 200_000
 """New objects after which Python looks for garbage. With its own threshold of 700, a tenth of the processor time of a
 cold fit goes into searching imported modules and traces, none of which is garbage."""
 
-MODULES = {
-    "fitting": ("fit", "modes", "validate", "compare"),
-    "online": ("online",),
-    "checking": ("init", "examples", "check", "simulate", "design", "paper"),
+COMMANDS = {
+    "fit": "fit",
+    "modes": "modes",
+    "validate": "validation",
+    "compare": "comparison",
+    "online": "online",
+    "init": "init",
+    "examples": "examples",
+    "check": "check",
+    "simulate": "simulation",
+    "design": "experiment_design",
+    "paper": "paper",
 }
-"""Modules and their commands, in the order of --help."""
-
-COMMANDS = {name: module for module, names in MODULES.items() for name in names}
+"""Commands and their modules, in the order of --help."""
 
 
 def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import switchfit as sf
-from switchfit.cli import terminal
-from switchfit.cli.terminal import option, output_folder
+from switchfit.cli import command, errors, files, interrupts, options, terminal
+from switchfit.cli.options import option, output_folder
 from switchfit.runtime.presentation import format_count
 
 if TYPE_CHECKING:
+    from switchfit.cli.live_page import LivePage
     from switchfit.io.problem_file.building import ProblemFile
     from switchfit.online.estimator import OnlineEstimator
     from switchfit.online.state import Now
-    from switchfit.report.html.live import LivePage
 
 LEAST_ROOM = 4096
 """Times for which there is room, if the log has not more."""
@@ -32,35 +32,42 @@ REFUSED = (ValueError, TypeError, OverflowError)
 Replayed = Annotated[
     Path | None, typer.Option("--replay", metavar="LOG", help="Log to feed. Default: that of the problem file.")
 ]
+
 Stdin = Annotated[
     bool, typer.Option("--stdin", help='Read samples from stdin, a line {"t": 0.1, "y": [1.2], "u": [0.3]} each.')
 ]
+
 Window = Annotated[
     float | None,
     option(metavar="TIME", help="How long samples are kept. Default: that of the file, or all, up to 4096."),
 ]
+
 FalseAlarms = Annotated[
     float | None,
     option(metavar="RATE", help="False alarms per time unit: finds the threshold by simulation, in a minute."),
 ]
+
 Threshold = Annotated[float | None, option(metavar="NUMBER", help="Statistic at which to alarm. Default: 12.")]
 Budget = Annotated[float | None, option(metavar="SECONDS", help="Most that an update may take. Default: no limit.")]
 MaxSwitches = Annotated[int, option(metavar="COUNT", help="Most changes in the window, or in all. Default: 8.")]
+
 StateFile = Annotated[
     Path | None, option("--state", metavar="FILE", help="Go on from this file, if it exists; save to it at the end.")
 ]
+
 JournalFile = Annotated[
     Path | None, option("--journal", metavar="FILE", help="Write each sample to this file first: a crash loses none.")
 ]
+
 Live = Annotated[
     int | None,
     option("--live", metavar="PORT", help="Show a page at http://127.0.0.1:PORT until Ctrl-C; 0: a free port."),
 ]
 
 
-@terminal.command("quiet", "verbose")
+@command.command("quiet", "verbose")
 def online(
-    problem: terminal.ProblemPath,
+    problem: options.ProblemPath,
     replay: Replayed = None,
     stdin: Stdin = False,
     window: Window = None,
@@ -72,7 +79,7 @@ def online(
     journal: JournalFile = None,
     live: Live = None,
     out: Annotated[Path | None, output_folder("online.txt and online.png")] = None,
-    figures: terminal.FigureFormat = "png",
+    figures: options.FigureFormat = "png",
 ) -> None:
     """Estimate while the samples come in: which mode is it now, since when, with which parameters?
 
@@ -84,8 +91,8 @@ def online(
     of stdin, which are reported and left out.
     """
     if stdin and replay is not None:
-        terminal.fail("--replay and --stdin contradict each other; give one of them.")
-    loaded = terminal.load(problem, out, log=replay, searched=True, streamed=stdin)
+        errors.fail("--replay and --stdin contradict each other; give one of them.")
+    loaded = files.load(problem, out, log=replay, searched=True, streamed=stdin)
     for issue in loaded.issues:
         terminal.print_note(issue)
     from switchfit.online.log import build_log
@@ -95,7 +102,7 @@ def online(
         file.parent.mkdir(parents=True, exist_ok=True)
     sensors = loaded.problem.experiments[0].measurements
     room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
-    settings = loaded.contents.online.model_dump(exclude_none=True) | terminal.select_given(window=window)
+    settings = loaded.contents.online.model_dump(exclude_none=True) | options.select_given(window=window)
     settings |= {"max_switches": max_switches, "budget": budget, "capacity": room}
     library = build_library(loaded.problem, **loaded.library)  # modes that it leaves out never follow
     settings |= {"successions": library.successions, "min_duration": library.durations}
@@ -103,20 +110,20 @@ def online(
     with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
         recorded, refused, interrupted = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
         if estimator.now is None:
-            terminal.fail("there were no samples.")
+            errors.fail("there were no samples.")
         if state is not None:
             estimator.save(state)
         if out is not None and recorded:
-            terminal.write_result(build_log(loaded.problem, recorded), out / "online", figures)
+            files.write_result(build_log(loaded.problem, recorded), out / "online", figures)
         if page is not None and not interrupted:
-            with contextlib.suppress(terminal.CtrlC):
+            with contextlib.suppress(interrupts.CtrlC):
                 terminal.print_note("the samples have ended; Ctrl-C ends the page")
                 page.wait()
-    terminal.fail_for_refused(loaded.issues)
+    errors.fail_for_refused(loaded.issues)
     if refused:
-        terminal.fail(f"{format_count(refused, 'line')} of stdin could not be used.")
+        errors.fail(f"{format_count(refused, 'line')} of stdin could not be used.")
     if estimator.now.status.name == "LOST":
-        terminal.end_unreliable(f"{estimator.now.status.value}.")
+        errors.end_unreliable(f"{estimator.now.status.value}.")
 
 
 def _start(
@@ -143,13 +150,13 @@ def _run(
 
     Return what it said, if that is recorded, how many lines of stdin it refused, and whether it was interrupted.
     """
-    from switchfit.io.command_line import read_sample, summarize_now
+    from switchfit.cli.sample_lines import read_sample, summarize_now
     from switchfit.online.state import list_updates
 
     recorded, refused = [], 0
     (run,) = loaded.problem.experiments
     last = -math.inf if estimator.now is None else estimator.now.time
-    with terminal.stop_on_interrupt(repr, "sample") as report:
+    with interrupts.stop_on_interrupt(repr, "sample") as report:
         stopped = partial(report, None)
         logged = list_updates([(item.times, item.values) for item in run.data])
         samples: Iterable[Any] = _read_lines(stopped) if stdin else ((t, y, None) for t, y in logged if t > last)
@@ -181,9 +188,9 @@ def _read_lines(stopped: Callable[[], bool]) -> Iterator[bytes]:
     stream = typer.get_binary_stream("stdin")
     while True:
         try:
-            with terminal.handle_interrupt(terminal.interrupt):
+            with interrupts.handle_interrupt(interrupts.interrupt):
                 line = b"" if stopped() else stream.readline()
-        except terminal.CtrlC:
+        except interrupts.CtrlC:
             signal.raise_signal(signal.SIGINT)  # for the handler that makes `stopped` true
             return
         if not line:
@@ -192,7 +199,7 @@ def _read_lines(stopped: Callable[[], bool]) -> Iterator[bytes]:
 
 
 def _serve(loaded: ProblemFile, port: int) -> LivePage:
-    from switchfit.report.html.live import LivePage
+    from switchfit.cli.live_page import LivePage
 
     page = LivePage(loaded.path.name, loaded.problem, port)
     terminal.print_note(f"live at {page.address}")

@@ -1,10 +1,9 @@
-"""The mesh: fixed nodes, cut by the transition times; and the arrays of an experiment on it.
+"""The mesh of an experiment: fixed nodes, and the rows into which the transition times cut the cells between them.
 
 The *nodes* of an experiment are t0, tf, all sample times, the knots of inputs and reference signals, the times of
-corners that follow from t and the input alone (`corner_times`) and a refinement grid. They are fixed while the
-optimizer runs. The transition times cut the *cells* between them into *rows*: one row is one Runge-Kutta step, in one
-mode, inside one cell. Samples, knots and transitions are thus always ends of rows, and only the two rows at a
-transition move with it.
+corners that follow from t and the input alone, and a refinement grid. They are fixed while the optimizer runs. The
+transition times cut the *cells* between them into *rows*: one row is one Runge-Kutta step, in one mode, inside one
+cell. Samples, knots and transitions are thus always ends of rows, and only the two rows at a transition move with it.
 
 Rows are numbered by ``cell + segment``, where a segment is the time a mode is active: no shape depends on the
 transition times.
@@ -17,62 +16,24 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial
-from switchfit.problem.experiment import Experiment, initial_state_of
-from switchfit.problem.problem import Problem
-from switchfit.problem.structure import pad_length
+from switchfit.discretization.stiffness import Stiffness
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.padding import pad_length
+from switchfit.problem.validation.arrays import FloatArray
 
 SHARP = 1e-3
 """Part of the longest cell of a mesh below which its shortest one says that the model is sharp: 1e-6 to 1e-4 where
 friction is regularised at 1e-3 m/s and less, 2e-3 and more for smooth models."""
 
+MANY_STEPS = 32
+"""Steps inside a cell from which it matters whether stability limits them."""
 
-@dataclass(frozen=True)
-class Stiffness:
-    """Why ``solver="auto"`` takes implicit steps in a mode of an experiment; print it for a sentence.
-
-    Attributes
-    ----------
-    mode : str
-    explicit_steps, implicit_steps : int
-        Steps that either method needs in it, to the same tolerance.
-    stability : float
-        ``|lambda| h`` of the explicit steps, lambda being the largest eigenvalue of the Jacobian whose component
-        decays. An explicit method is unstable above about 3.3.
-
-    See Also
-    --------
-    Problem : takes `solver`.
-    Evaluation, evaluate
-
-    Examples
-    --------
-    >>> import jax.numpy as jnp
-    >>> import switchfit as sf
-    >>> fast = sf.HybridSystem({"relax": lambda t, x, p: -p["rate"] * (x - jnp.cos(t))}, [0.0])
-    >>> run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("relax",), (), 0.0, 10.0)
-    >>> problem = sf.Problem(fast, run, {"rate": 1e5})
-    >>> found = sf.evaluate(problem).stiffness[0]
-    >>> found.mode, found.implicit_steps < found.explicit_steps / 100
-    ('relax', True)
-    """
-
-    mode: str
-    explicit_steps: int
-    implicit_steps: int
-    stability: float
-
-    def __str__(self) -> str:
-        return (
-            f"mode {self.mode!r} is stiff: it takes {self.explicit_steps:,} explicit steps (limited by stability: "
-            f"|lambda| h is about {self.stability:.2g}) or {self.implicit_steps:,} implicit ones; implicit ones were "
-            "chosen for this mode"
-        )
+PARTS_OF_CELL = 4
+"""Into which the steps of a cell are divided, to see where they are shortest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,13 +149,6 @@ def _count_steps(solutions: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     return times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))])
 
 
-MANY_STEPS = 32
-"""Steps inside a cell from which it matters whether stability limits them."""
-
-PARTS = 4
-"""Into which the steps of a cell are divided, to see where they are shortest."""
-
-
 def _compare_densities(nodes: FloatArray, times: FloatArray, counts: FloatArray) -> FloatArray:
     """Return how many times as dense as the nodes of `_grade_nodes` the steps of a solver are in each cell, where it is
     not all rest: explicit steps are unstable if they are longer.
@@ -202,8 +156,8 @@ def _compare_densities(nodes: FloatArray, times: FloatArray, counts: FloatArray)
     low, high, lengths = np.interp(nodes[:-1], times, counts), np.interp(nodes[1:], times, counts), np.diff(nodes)
     # The second shortest quarter of the s steps in a cell of length T takes s h / 4: the first steps of a solve may
     # make one shorter. There the density of s nodes is s (1 / (s h) + 1 / T) / 2, and that of the steps 1 / h.
-    quarters = np.interp(np.linspace(low, high, PARTS + 1, axis=1), counts, times)
-    return np.asarray(2.0 / (1.0 + PARTS * np.sort(np.diff(quarters), axis=1)[:, 1] / lengths))
+    quarters = np.interp(np.linspace(low, high, PARTS_OF_CELL + 1, axis=1), counts, times)
+    return np.asarray(2.0 / (1.0 + PARTS_OF_CELL * np.sort(np.diff(quarters), axis=1)[:, 1] / lengths))
 
 
 def _grade_nodes(nodes: FloatArray, step_times: FloatArray, steps: FloatArray, pieces: NDArray[np.intp]) -> FloatArray:
@@ -230,7 +184,7 @@ def _grade_nodes(nodes: FloatArray, step_times: FloatArray, steps: FloatArray, p
     return np.interp(cut + turn / pieces[cut], position, times)
 
 
-class Rows(NamedTuple):
+class MeshRows(NamedTuple):
     """The rows of a mesh at given transition times: R = cells + N of them, in the order of time, in JAX or NumPy.
 
     Attributes
@@ -250,7 +204,7 @@ class Rows(NamedTuple):
     first_cell: Any
 
 
-def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
+def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> MeshRows:
     """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
 
     Where tau_i equals a node, `side` = +1 lets segment i begin in the cell after it, so that derivatives are those
@@ -278,122 +232,9 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     begins, finishes = xp.concatenate([nodes[:1], tau]), xp.concatenate([tau, nodes[-1:]])
     start = xp.where(opens, begins[segment], nodes[cell])
     end = xp.where(closes, finishes[segment], nodes[cell + 1])
-    return Rows(segment, cell, opens, start, end, first_row, first_cell)
+    return MeshRows(segment, cell, opens, start, end, first_row, first_cell)
 
 
 def find_row_ending_cell(first_cell: Any, cell: Any, xp: Any = jnp) -> Any:
     """Return the last row inside each of the given cells (K,), -1 for cell -1; segments begin in cells (N + 1,)."""
     return xp.where(cell < 0, -1, cell + (cell[:, None] >= first_cell[None, 1:]).sum(1))
-
-
-Array = jax.Array
-
-
-class Samples(NamedTuple):
-    """Discrete samples: cell that ends at each (K,), time (K,), value (K, q), weight (K, q), 0 where missing."""
-
-    cell: Array
-    time: Array
-    value: Array
-    weight: Array
-
-
-class Arguments(NamedTuple):
-    """Numbers of a run that are not estimated.
-
-    Attributes
-    ----------
-    nodes : (G + 1,)
-    signals : (G, 4, S)
-        Polynomial of each signal channel in each cell, in powers of time since the cell's first node: the
-        references in the order of the data, then the input.
-    fixed : values of the fixed parameters, in order
-    initial_state : (n,), zeros where it is a function of the parameters; unknown entries are ignored
-    samples : one `Samples` for each `Measurements`
-    weights : W of each `ReferenceSignal`, its diagonal (q,) where it is diagonal, else (q, q)
-    sequence : (N + 1,) int or None
-        Index of the mode of each segment, for programs that read it at run time; None where the structure has it.
-    """
-
-    nodes: Array
-    signals: Array
-    fixed: tuple[Array, ...]
-    initial_state: Array
-    samples: tuple[Samples, ...]
-    weights: tuple[Array, ...]
-    sequence: Array | None = None
-
-    def without_mesh(self) -> Arguments:
-        """Return the arguments that the functions of the model need: their shapes do not depend on the number of
-        nodes or samples.
-        """
-        return self._replace(nodes=np.zeros(2), signals=np.zeros((1, *self.signals.shape[1:])), samples=())  # type: ignore[arg-type]
-
-
-def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
-    """Return the NumPy arrays of experiment e on a mesh that has all its sample times and knots as nodes."""
-    return put_on_mesh(build_common_arguments(problem, e), problem.experiments[e], mesh)
-
-
-def put_on_mesh(common: Arguments, experiment: Experiment, mesh: Mesh) -> Arguments:
-    """Return the arguments of an experiment on a mesh, from those that suit any mesh."""
-    # Of each sample the index of the cell that ends at it; -1 for t0.
-    cells = (np.searchsorted(mesh.times, item.seen_times) - 1 for item in experiment.measurements)
-    samples = tuple(
-        padded._replace(cell=_pad_with_last(cell, len(padded.time), 0))  # type: ignore[arg-type]  # made jax arrays
-        for cell, padded in zip(cells, common.samples, strict=True)
-    )
-    # Every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S).
-    split = [split_by_cell(signal, mesh) for signal in experiment.signals]
-    signals = split[0] if len(split) == 1 else np.concatenate([np.zeros((len(mesh.nodes) - 1, 4, 0)), *split], axis=2)
-    return common._replace(nodes=mesh.nodes, signals=signals, samples=samples)  # type: ignore[arg-type]  # made jax arrays
-
-
-def build_common_arguments(problem: Problem, e: int) -> Arguments:
-    """Return the arguments of experiment e that suit any mesh, without nodes, signals and the cells of samples."""
-    structure, experiment = problem.structures[e], problem.experiments[e]
-    initial = initial_state_of(problem.system, experiment)
-    unread = (experiment.parameter_map.get(name, name) for name, _, read in structure.parameters if not read)
-    fixed = tuple(problem.parameters[name].value for name in unread)
-    lengths = problem.sample_lengths[e]
-    samples = tuple(_pad_samples(*each, experiment.t0) for each in zip(experiment.measurements, lengths, strict=True))
-    weights = tuple(_drop_off_diagonal_zeros(item.weights) for item in experiment.references)
-    x0 = np.zeros(structure.n) if callable(initial) else np.array([getattr(x, "value", x) for x in initial], float)
-    empty = np.zeros(0)
-    return Arguments(empty, empty, fixed, x0, samples, weights)  # type: ignore[arg-type]
-
-
-def _drop_off_diagonal_zeros(W: FloatArray) -> FloatArray:
-    """Return the diagonal of a diagonal matrix, which takes q products instead of q squared at every stage of every
-    step; any other matrix unchanged.
-    """
-    diagonal = np.diag(W)
-    return diagonal if np.array_equal(W, np.diag(diagonal)) else W
-
-
-def _pad_samples(item: Measurements, length: int, t0: float) -> Samples:
-    """Return samples of one Measurements, padded with missing ones to a length, without their cells."""
-    rows = ((0, length - len(item.times)), (0, 0))
-    times, values = _pad_with_last(item.seen_times, length, t0), np.pad(np.nan_to_num(item.values), rows)
-    return Samples(np.zeros(0, int), times, values, np.pad(item.weights, rows))  # type: ignore[arg-type]  # made jax arrays
-
-
-def _pad_with_last(array: NDArray[Any], length: int, first: float) -> NDArray[Any]:
-    """Return an array padded to a length with its last entry, or `first`; `np.pad` takes ten times longer."""
-    padded = np.full(length, array[-1] if len(array) else first, array.dtype)
-    padded[: len(array)] = array
-    return padded
-
-
-def split_by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:
-    """Return one signal as a cubic in each cell of a mesh that has its knots as nodes: (G, 4, q)."""
-    starts, ends = mesh.nodes[:-1], mesh.nodes[1:]
-    k = signal.interval(0.5 * (starts + ends))
-    s = starts - signal.knots[k]
-    shifted = signal.coefficients.T.take(k, axis=2)  # cells last: loops over them are the fast ones
-    c0, c1, c2, c3 = shifted.swapaxes(0, 1)
-    bend = 3 * s * c3
-    c0 += s * (c1 + s * (c2 + s * c3))  # each before the coefficients that it is shifted by
-    c1 += s * (2 * c2 + bend)
-    c2 += bend
-    return np.ascontiguousarray(shifted.T)

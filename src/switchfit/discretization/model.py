@@ -1,6 +1,7 @@
 """The functions of one experiment, bound to its arguments while JAX traces a program.
 
-Nodes: maps of the state, costs and constraints at one time.
+Those between two nodes are the vector field of each mode and the running cost; those at a node map the state, cost, or
+constrain:
 
 start        ``x(t0) = x0(p)``
 reset        ``x(tau_i+) = R(tau_i, x(tau_i-), p)``
@@ -9,8 +10,8 @@ sample       a cost of (t, x, p) at the end of a row; of a late sample at the en
 transition   costs of, and constraints on, ``(tau_i, x(tau_i-), p)``
 end          costs of, and constraints on, ``(x(tf), p)``
 
-Engines differentiate the functions listed here without distinguishing kinds by name. All functions take (t, x, p). For
-a constraint, engines add ``weight . c`` to the cost, with the weights of a Lagrangian.
+Engines differentiate these functions without distinguishing kinds by name. All functions take (t, x, p). For a
+constraint, engines add ``weight . c`` to the cost, with the weights of a Lagrangian.
 """
 
 from __future__ import annotations
@@ -18,20 +19,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 
-from switchfit.discretization.mesh import Arguments, Samples
-from switchfit.discretization.rows import select_tableaus
-from switchfit.problem.data import FloatArray, influence, robust
+from switchfit.discretization.arguments import Arguments, Samples
+from switchfit.discretization.signals import Array, Piece
+from switchfit.discretization.tableaus import select_tableaus
 from switchfit.problem.functions import Function
+from switchfit.problem.losses import influence, robust
 from switchfit.problem.structure import Structure
-
-Array = jax.Array
+from switchfit.problem.validation.arrays import FloatArray
 
 Field = Callable[[Array, Array, Array], Array]
 """``f(t, x, p) -> (n,)`` of one mode, p being the flat vector of free parameters."""
@@ -39,45 +39,11 @@ Field = Callable[[Array, Array, Array], Array]
 Density = Callable[[Array, Array, Array], Array]
 """``ell(t, x, p) -> ()``: the sum of all running costs."""
 
+NodeFunction = Callable[[Any, Any, Any], Any]
 
-class Piece(NamedTuple):
-    """The signals in one cell: first node (), coefficients (4, S)."""
-
-    origin: Array
-    coefficients: Array
-
-    def __call__(self, t: Array) -> Array:
-        """All channels at time t: (S,)."""
-        return _polynomial(t - self.origin, self.coefficients)
-
-    def rate(self, t: Array) -> Array:
-        """The derivatives of all channels at time t: (S,)."""
-        return _polynomial(t - self.origin, jnp.arange(1.0, 4.0)[:, None] * self.coefficients[1:])
-
-
-@jax.custom_jvp
-def _polynomial(s: Array, c: Array) -> Array:
-    """Return ``c[0] + c[1] s + c[2] s**2 + ...``: (S,).
-
-    Its derivative in s is defined as a polynomial too. JAX would propagate a tangent in every direction through each
-    step of Horner's scheme, which took a quarter of an evaluation with a reference signal. The coefficients are data,
-    without tangents in all programs but those of `switchfit.experiment_design`, where an input is what is looked for.
-    """
-    value = c[-1]
-    for k in reversed(range(c.shape[0] - 1)):
-        value = c[k] + s * value
-    return value
-
-
-def _polynomial_jvp(at: tuple[Array, Array], direction: tuple[Any, Any]) -> tuple[Array, Array]:
-    (s, c), (s_d, c_d) = at, direction
-    powers = jnp.arange(1.0, c.shape[0])[:, None]
-    slope = _polynomial(s, powers * c[1:]) if c.shape[0] > 1 else jnp.zeros_like(c[0])
-    tangent = jnp.zeros_like(c[0]) if isinstance(s_d, SymbolicZero) else slope * s_d
-    return _polynomial(s, c), tangent if isinstance(c_d, SymbolicZero) else tangent + _polynomial(s, c_d)
-
-
-_polynomial.defjvp(_polynomial_jvp, symbolic_zeros=True)
+AT_TRANSITIONS = "guards", "transition_costs"
+"""Fields of `Structure` with a function for each transition, None for transitions without one. Guards are constraints,
+which have to be zero; the others are costs."""
 
 
 class Model:
@@ -253,14 +219,6 @@ def apply_weights(W: Array, r: Array) -> Array:
     if W.ndim == 2:
         return W @ r
     return W * r if r.ndim == 1 else W[:, None] * r
-
-
-NodeFunction = Callable[[Any, Any, Any], Any]
-
-
-AT_TRANSITIONS = "guards", "transition_costs"
-"""Fields of `Structure` with a function for each transition, None for transitions without one. Guards are constraints,
-which have to be zero; the others are costs."""
 
 
 def get_transition_function(model: Model, kind: str, i: int, piece: Piece | None = None) -> NodeFunction:

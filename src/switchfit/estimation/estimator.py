@@ -33,12 +33,15 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit, invert, measure_quantile
 from switchfit.fit.trajectory import Trajectory, compare
-from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_choice, as_flag, as_instance, as_path
-from switchfit.runtime.files import from_json, read_document, to_json, write_atomically, write_document
+from switchfit.problem.validation.arrays import FloatArray
+from switchfit.problem.validation.names import as_choice
+from switchfit.problem.validation.objects import as_flag, as_instance, as_path
+from switchfit.runtime.files import write_atomically
 from switchfit.runtime.frames import Tabular, build_pandas, describe_frame
+from switchfit.runtime.json_documents import read_document, write_document
+from switchfit.runtime.json_records import from_json, to_json
 from switchfit.runtime.presentation import (
     Displayed,
     Drawn,
@@ -74,13 +77,18 @@ from switchfit.uncertainty.walks import (
 if TYPE_CHECKING:
     import pandas
 
-
 TableKind = Literal["unknowns", "trajectories", "residuals", "history"]
 TABLES = get_args(TableKind)
 CovarianceKind = Literal["exact", "gauss-newton", "sandwich"]
 
 MOST_SENSITIVITIES = 2**28
 """Largest size, in bytes, of the derivatives of states and outputs at all nodes; above it, figures have no bands."""
+
+PACKAGES = ("switchfit", "daqp", "jax", "jaxlib", "llvmlite", "numpy", "scipy")
+"""Whose versions are kept."""
+
+FORMAT = "switchfit fit"
+VERSION = 11
 
 
 @dataclass(frozen=True, eq=False)
@@ -869,10 +877,6 @@ def _describe_clock(run: Trajectory | Experiment) -> str:
     return run.time_unit if run.origin is None else f"{run.time_unit} since {run.origin.date}"
 
 
-PACKAGES = ("switchfit", "daqp", "jax", "jaxlib", "llvmlite", "numpy", "scipy")
-"""Whose versions are kept."""
-
-
 @cache
 def find_version(package: str) -> str:
     """Return the version of a package.
@@ -958,10 +962,6 @@ def make_relative(path: str | Path, folder: str | Path) -> str:
         return Path(os.path.relpath(whole, os.path.abspath(folder))).as_posix()
     except ValueError:
         return Path(whole).as_posix()
-
-
-FORMAT = "switchfit fit"
-VERSION = 11
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provenance | None = None) -> None:

@@ -21,14 +21,17 @@ from switchfit.fit.result import Termination, count_priors, count_samples, measu
 from switchfit.fit.solution import explain_nonfinite, minimize_cost
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS
-from switchfit.optimize.matrix import Dense, null_space
-from switchfit.optimize.problem import HessianKind
-from switchfit.optimize.sqp import NEGATIVE_CURVATURE
-from switchfit.problem.data import FloatArray
-from switchfit.problem.inspection import find_comparisons, find_cost_corner
+from switchfit.optimize.curvature import null_space
+from switchfit.optimize.dense import Dense
+from switchfit.optimize.minimization_problem import HessianKind
+from switchfit.optimize.stationary_points import NEGATIVE_CURVATURE
+from switchfit.problem.comparisons import find_comparisons, find_cost_corner
 from switchfit.problem.problem import Problem, keep_with_problem
-from switchfit.problem.validation import as_choice, as_count, as_positive, join_names, shorten
-from switchfit.runtime.errors import Issue, NotIntegrableError
+from switchfit.problem.validation.arrays import FloatArray, as_count, as_positive
+from switchfit.problem.validation.messages import join_names, shorten
+from switchfit.problem.validation.names import as_choice
+from switchfit.runtime.errors import NotIntegrableError
+from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 
 HESSIANS = get_args(HessianKind)

@@ -38,22 +38,44 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.discretization.mesh import Arguments, Mesh
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, list_transition_functions
-from switchfit.engine.adaptive import refine_mesh_of_run
-from switchfit.engine.choice import SplitEngine
-from switchfit.engine.protocol import Evaluation, Matrix
+from switchfit.engine.corners.split_engine import SplitEngine
+from switchfit.engine.evaluation import Evaluation, Matrix
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.data import FloatArray
+from switchfit.meshes.refinement import refine_mesh_of_run
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.errors import NotIntegrableError
 
 PERFECT_FIT = 1e-3
 """If J has fallen below this part of its first value, the integration error is relative to that part, since a cost that
 vanishes has no relative error."""
+
+LARGEST_ROW_ERROR = 1e-3
+"""Estimate of the error of a row, relative to the size of its state, above which a mesh is made anew. The estimate has
+the order 4, the error 6: where the estimate is 1e-3, the error of a row is about 1e-3**1.5 = 3e-5 in a smooth model,
+and 1e-3 where a kink is inside the row. Fits of the bed of poor starts end with 1e-7 to 1e-5 on meshes that suit them,
+and with 0.01 to 1 on those of far guesses."""
+
+ACCURACY = 10.0
+"""Relative accuracy of J where steps pass thin layers, in units of rtol: J of the benchmark differs by 1e-8 to
+1e-7 from mesh to mesh."""
+
+MOST_STEPS = 20
+"""Largest number of steps of the adaptive solve at a trial, as a multiple of the cells of the mesh: a trial that needs
+more is refused."""
+
+WRONG = 10.0
+"""Factor by which a Hessian has to misjudge how J bends along a step to be doubted. Where friction is regularised at
+1e-6 m/s, it does so by 500, and halved cells change its entries by their own size; those of smooth models by 1e-6."""
+
+_Point = tuple[FloatArray, Evaluation[Any]]
+"""A theta, and J with its derivatives there."""
 
 
 def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: float) -> float:
@@ -109,28 +131,6 @@ def _evaluate_constraints(
         return jnp.concatenate(values)
 
     return evaluate(ends), jax.jacfwd(evaluate)(ends)
-
-
-LARGEST_ROW_ERROR = 1e-3
-"""Estimate of the error of a row, relative to the size of its state, above which a mesh is made anew. The estimate has
-the order 4, the error 6: where the estimate is 1e-3, the error of a row is about 1e-3**1.5 = 3e-5 in a smooth model,
-and 1e-3 where a kink is inside the row. Fits of the bed of poor starts end with 1e-7 to 1e-5 on meshes that suit them,
-and with 0.01 to 1 on those of far guesses."""
-
-ACCURACY = 10.0
-"""Relative accuracy of J where steps pass thin layers, in units of rtol: J of the benchmark differs by 1e-8 to
-1e-7 from mesh to mesh."""
-
-MOST_STEPS = 20
-"""Largest number of steps of the adaptive solve at a trial, as a multiple of the cells of the mesh: a trial that needs
-more is refused."""
-
-WRONG = 10.0
-"""Factor by which a Hessian has to misjudge how J bends along a step to be doubted. Where friction is regularised at
-1e-6 m/s, it does so by 500, and halved cells change its entries by their own size; those of smooth models by 1e-6."""
-
-_Point = tuple[FloatArray, Evaluation[Any]]
-"""A theta, and J with its derivatives there."""
 
 
 class Follower:

@@ -18,26 +18,53 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.mesh import Arguments, Mesh, Stiffness
-from switchfit.engine.adaptive import refine_if_unstable, refine_mesh_of_run
-from switchfit.engine.choice import SmoothEngine, SplitEngine, engine_of, summarize
-from switchfit.engine.native.engine import NativeEngine
-from switchfit.engine.protocol import DenseEvaluation, Engine, Evaluation, Matrix, Run, Simulation, runs_of
-from switchfit.optimize.matrix import Arrow, ArrowLayout
-from switchfit.optimize.problem import Breakpoints
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.stiffness import Stiffness
+from switchfit.engine.choice import engine_of, summarize
+from switchfit.engine.corners.split_engine import SmoothEngine, SplitEngine
+from switchfit.engine.evaluation import DenseEvaluation, Engine, Evaluation, Matrix
+from switchfit.engine.native.native_engine import NativeEngine
+from switchfit.engine.run import Run, runs_of
+from switchfit.engine.simulation import Simulation
+from switchfit.meshes.refinement import refine_if_unstable, refine_mesh_of_run
+from switchfit.optimize.arrow import Arrow, ArrowLayout
+from switchfit.optimize.breakpoints import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint
+from switchfit.problem.costs import TerminalConstraint
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.functions import use_float64
-from switchfit.problem.parameter import PriorTerms
+from switchfit.problem.measurements import Measurements
+from switchfit.problem.padding import choose_common_lengths
+from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem, keep_with_problem
-from switchfit.problem.structure import Structure, choose_common_lengths
-from switchfit.problem.validation import as_choice, as_instance, join_names, shorten
+from switchfit.problem.reference_signals import ReferenceSignal
+from switchfit.problem.structure import Structure
+from switchfit.problem.validation.arrays import FloatArray
+from switchfit.problem.validation.messages import join_names, shorten
+from switchfit.problem.validation.names import as_choice
+from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.presentation import format_line, join_first
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
+ITERATIONS = 60
+
+#: After a Newton step below this part of a transition time, its error is rounding.
+NEGLIGIBLE = 1e-10
+
+#: Part of the way to the next transition that one step may take.
+ROOM = 0.9
+
+NO_VARIATION = 1e-9
+"""Standard deviation of a channel, relative to its largest value, below which it counts as constant (rounding)."""
+
+REFERENCE_POINTS = 400
+"""Points at which a reference signal is compared with its mean."""
+
+ASSUMED_NOISE = 0.01
+"""Noise where sigma is unknown, as a part of the variation of the data."""
 
 
 class Evaluator:
@@ -335,13 +362,6 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     return replace(found, constraints=held.constraints, jacobian=held.jacobian, stiffness=evaluator.stiffness)
 
 
-ITERATIONS = 60
-#: After a Newton step below this part of a transition time, its error is rounding.
-NEGLIGIBLE = 1e-10
-#: Part of the way to the next transition that one step may take.
-ROOM = 0.9
-
-
 @dataclass(frozen=True, eq=False)
 class GuardedEvaluation:
     """Cost and derivatives in the unknowns that guards leave free, r of them.
@@ -520,16 +540,6 @@ def find_guards(problem: Problem) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     if np.any(found < 0):
         raise ValueError("A transition with a guard cannot have a fixed time: its guard says when it happens.")
     return found, np.concatenate(rows).astype(np.intp)
-
-
-NO_VARIATION = 1e-9
-"""Standard deviation of a channel, relative to its largest value, below which it counts as constant (rounding)."""
-
-REFERENCE_POINTS = 400
-"""Points at which a reference signal is compared with its mean."""
-
-ASSUMED_NOISE = 0.01
-"""Noise where sigma is unknown, as a part of the variation of the data."""
 
 
 @keep_with_problem

@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.protocol import Engine
+from switchfit.engine.evaluation import Engine
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Result, Status
-from switchfit.optimize.state import Finding
+from switchfit.optimize.result import LineSearchFailure
 from switchfit.optimize.threads import one_thread
-from switchfit.problem.data import FloatArray
-from switchfit.problem.inspection import find_comparisons, find_unread
+from switchfit.problem.comparisons import find_comparisons
+from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.problem import Problem
-from switchfit.problem.unknowns import ActiveConstraint
-from switchfit.problem.validation import as_level
+from switchfit.problem.reads import find_unread
+from switchfit.problem.validation.arrays import FloatArray, as_level
 from switchfit.runtime import special
-from switchfit.runtime.errors import Issue
+from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import Printed
 
 NAMED = 4
@@ -33,6 +33,18 @@ NAMED = 4
 
 SMALL_WEIGHT = 0.1
 """Unknowns with a weight below this in a direction of unit length are not named."""
+
+Rival = tuple[str, float, float]
+
+UNDETERMINED = 1e-14
+"""Eigenvalue of the Hessian, scaled to a diagonal of one, up to which a direction is not determined."""
+
+PART = 1e-6
+"""Component of an unknown in such a direction above which the unknown has no standard error."""
+
+STEEP = 100.0
+"""Slope at a kink, times the standard deviation of the parabola beside it, from which on the curvature is left out: it
+changes the variance by less than 1e-3, and further out integrals with it lose all digits."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +172,7 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
     )
 
 
-def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue | None:
+def _describe_failure(result: Result, found: LineSearchFailure, problem: Problem) -> Issue | None:
     """Return why the line search failed, with the names of the unknowns; of a fit that has converged a "switch" alone.
 
     A jump of J is a switch if a function compares with the unknown: where, is the second subject of the issue.
@@ -250,9 +262,6 @@ class Step:
     evaluations: int
     seconds: float
     ended: str = ""
-
-
-Rival = tuple[str, float, float]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -671,13 +680,6 @@ def interval(theta: FloatArray, half: FloatArray, log: NDArray[np.bool_], origin
     return np.stack([np.where(log, low, theta - half), np.where(log, high, theta + half)], axis=-1)
 
 
-UNDETERMINED = 1e-14
-"""Eigenvalue of the Hessian, scaled to a diagonal of one, up to which a direction is not determined."""
-
-PART = 1e-6
-"""Component of an unknown in such a direction above which the unknown has no standard error."""
-
-
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
     """Return ``Z (Z' H Z)^-1 Z'``: (d, d); NaN if H is not finite, or not positive definite on Z (d, k).
 
@@ -763,11 +765,6 @@ def free_kinks(
     else:  # J is no minimum along all kinks together: each of them as if the others were held
         V = np.diag(variances)
     return np.asarray(inverse + follow @ V @ follow.T)  # (2)
-
-
-STEEP = 100.0
-"""Slope at a kink, times the standard deviation of the parabola beside it, from which on the curvature is left out: it
-changes the variance by less than 1e-3, and further out integrals with it lose all digits."""
 
 
 def measure_kink_variance(slopes: FloatArray, curvatures: FloatArray) -> FloatArray:

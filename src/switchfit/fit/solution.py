@@ -30,27 +30,33 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.model import Model
 from switchfit.discretization.rows import stages
-from switchfit.engine.native.engine import NativeEngine
-from switchfit.engine.protocol import Evaluation, Matrix, Simulation
+from switchfit.discretization.signals import Piece
+from switchfit.engine.evaluation import Evaluation, Matrix
+from switchfit.engine.native.native_engine import NativeEngine
+from switchfit.engine.simulation import Simulation
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
 from switchfit.optimize.algebra import EPS
-from switchfit.optimize.matrix import Arrow
-from switchfit.optimize.problem import Breakpoints, HessianKind
-from switchfit.optimize.problem import Problem as Minimization
-from switchfit.optimize.state import Finding
+from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.breakpoints import Breakpoints
+from switchfit.optimize.minimization_problem import HessianKind
+from switchfit.optimize.minimization_problem import MinimizationProblem as Minimization
+from switchfit.optimize.result import LineSearchFailure
 from switchfit.optimize.threads import with_own_threads
-from switchfit.problem.data import FloatArray
+from switchfit.problem.comparisons import find_comparisons
 from switchfit.problem.experiment import Experiment
+from switchfit.problem.finiteness import find_undefined
 from switchfit.problem.functions import Function, use_float64
-from switchfit.problem.inspection import find_comparisons, find_undefined, find_unread
 from switchfit.problem.problem import Problem, keep_with_problem
+from switchfit.problem.reads import find_unread
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.unknowns import Variables
-from switchfit.runtime.errors import HiddenSwitchError, Issue
+from switchfit.problem.validation.arrays import FloatArray
+from switchfit.problem.variables import Variables
+from switchfit.runtime.errors import HiddenSwitchError
+from switchfit.runtime.issue import Issue
 
 CHANGES = (0.1, -0.1)
 """Relative changes of a parameter to test its effect; if it is 0, relative to the range between its bounds."""
@@ -60,6 +66,27 @@ NO_EFFECT = 1e-12
 
 ROUNDING = 32 * EPS
 """Rounding error of the difference of two times, as a part of their size."""
+
+MANY_RUNS = 16
+"""Number of experiments from which the arrow shape of the Hessian is used; with fewer, the algebra of full matrices
+takes no longer (the runs part of the benchmarks)."""
+
+REACH, TIME_REACH = 0.1, 0.01
+"""Largest change in the first trust-region step: of an unknown as a part of its size, of a transition time as a part of
+the horizon."""
+
+BESIDE, NEAR = 2e-9, 1e-6
+"""Distance from a sample, as a part of the horizon, at which a time is held, and within which it is looked for. It is
+just not at the sample for intervals."""
+
+_Visit = tuple[str, Function, Sequence[FloatArray]]
+"""A function's role, the function, and arguments with which it is called: times, states and inputs of N points each."""
+
+HIDDEN_CHANGES = (1e-3, 1e-2, 0.1, 0.5, -1e-3, -1e-2, -0.1, -0.5)
+"""Relative changes of a parameter that are tried; if it is 0, relative to the range between its bounds."""
+
+CHANGED = 1e-9
+"""Smallest relative change of the cost that is not rounding."""
 
 
 def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> NDArray[np.bool_]:
@@ -108,15 +135,6 @@ def _list_parameters(problem: Problem) -> list[int]:
     spans = problem.unknowns.parameters.values()
     without = {name for names in find_unread(problem) for name in names}
     return [i for span in spans for i in range(span.start, span.stop) if problem.theta_names[i] not in without]
-
-
-MANY_RUNS = 16
-"""Number of experiments from which the arrow shape of the Hessian is used; with fewer, the algebra of full matrices
-takes no longer (the runs part of the benchmarks)."""
-
-REACH, TIME_REACH = 0.1, 0.01
-"""Largest change in the first trust-region step: of an unknown as a part of its size, of a transition time as a part of
-the horizon."""
 
 
 def minimize_cost(
@@ -196,11 +214,6 @@ def minimize_cost(
         return result
     converted = change.convert_result(result)
     return converted if not names else _convert_constrained(evaluator, converted)
-
-
-BESIDE, NEAR = 2e-9, 1e-6
-"""Distance from a sample, as a part of the horizon, at which a time is held, and within which it is looked for. It is
-just not at the sample for intervals."""
 
 
 def _hold_at_jumps(posed: Minimization, result: Result) -> Result:
@@ -371,7 +384,7 @@ class _Change(NamedTuple):
             explain=find and cache(lambda: self._convert_finding(result.theta, find())),
         )
 
-    def _convert_finding(self, z: FloatArray, found: Finding) -> Finding:
+    def _convert_finding(self, z: FloatArray, found: LineSearchFailure) -> LineSearchFailure:
         """Return why the line search failed, in theta instead of the variables z (d,)."""
         moved = ((i, np.where(np.arange(len(z)) == i, value, z)) for i, value in found.places)
         return found._replace(places=tuple((i, float(self.variables.outward(there)[i])) for i, there in moved))
@@ -386,10 +399,6 @@ def _convert_constrained(evaluator: Evaluator, result: Result) -> Result:
     slopes = evaluator.problem.unknowns.variables.slopes(result.theta)[0]
     basis = np.linalg.qr(slopes[:, None] * result.free_basis)[0]
     return replace(result, hessian=here.hessian, curvature=replace(result.curvature, basis=basis))
-
-
-_Visit = tuple[str, Function, Sequence[FloatArray]]
-"""A function's role, the function, and arguments with which it is called: times, states and inputs of N points each."""
 
 
 def explain_nonfinite(evaluator: Evaluator, theta: FloatArray) -> Issue | None:
@@ -485,13 +494,6 @@ def _list_stages(model: Model, p: Any, simulation: Simulation, mode: int, rows: 
     with use_float64():
         found = jax.jit(jax.vmap(evaluate))(*(values[rows] for values in given), nodes[cells], signals[cells])
     return [np.asarray(each).reshape(-1, *each.shape[2:]) for each in found]
-
-
-HIDDEN_CHANGES = (1e-3, 1e-2, 0.1, 0.5, -1e-3, -1e-2, -0.1, -0.5)
-"""Relative changes of a parameter that are tried; if it is 0, relative to the range between its bounds."""
-
-CHANGED = 1e-9
-"""Smallest relative change of the cost that is not rounding."""
 
 
 def refuse_hidden_switches(

@@ -10,16 +10,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.engine.adaptive import refine_mesh_of_run
 from switchfit.engine.choice import engine_of
-from switchfit.engine.protocol import Simulation, runs_of
+from switchfit.engine.run import runs_of
+from switchfit.engine.simulation import Simulation
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.data import FloatArray, ReferenceSignal
-from switchfit.problem.dates import Origin
+from switchfit.meshes.refinement import refine_mesh_of_run
 from switchfit.problem.experiment import Experiment, count_times, drop_jumps, show_time
-from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index, as_instance, set_fields
+from switchfit.problem.reference_signals import ReferenceSignal
+from switchfit.problem.validation.arrays import FloatArray, as_array, as_index
+from switchfit.problem.validation.messages import unit_suffix
+from switchfit.problem.validation.objects import as_instance, set_fields
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import format_line, join_first
 

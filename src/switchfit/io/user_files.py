@@ -1,4 +1,4 @@
-"""Files that users name: Python files, whose objects are loaded and errors located."""
+"""Python files of users: load objects from them, and locate the errors that are raised in them."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ from switchfit.runtime.errors import InputError, get_first_line
 
 _REFERENCE = re.compile(r"(.+\.py):(\w+)")
 """How a problem file names an object in a Python file."""
+
+#: Files that were run: absolute path -> path as the user wrote it.
+_files: dict[str | None, Path] = {}
 
 
 def load_object(reference: str, folder: Path, what: str) -> Any:
@@ -169,10 +172,6 @@ def find_user_place(error: BaseException | None) -> str | None:
     frame = frames[-1]
     inside = "" if frame.name == "<module>" else f", in {frame.name}"
     return f"{_files[frame.filename]}, line {frame.lineno}{inside}"
-
-
-#: Files that were run: absolute path -> path as the user wrote it.
-_files: dict[str | None, Path] = {}
 
 
 @functools.cache

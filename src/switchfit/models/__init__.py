@@ -3,11 +3,14 @@
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
-from switchfit.models.friction import lugre, rolling_body, sliding_block
+from switchfit.models.bicycle import bicycle
+from switchfit.models.differential_drive import differential_drive
 from switchfit.models.heater import heater_problem
+from switchfit.models.lugre import lugre
 from switchfit.models.magic_formula import magic_formula
+from switchfit.models.rolling_body import rolling_body
 from switchfit.models.skid_steer import skid_steer
-from switchfit.models.wheeled import bicycle, differential_drive
+from switchfit.models.sliding_block import sliding_block
 from switchfit.problem.system import HybridSystem
 
 #: Name in a problem file -> function that returns the system; its arguments are keyword-only.

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.problem.data import Measurements
 from switchfit.problem.experiment import Experiment
+from switchfit.problem.measurements import Measurements
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 
-OFF, LOSS, NOISE = 2.5, 0.4, 0.2
+OFF, LOSS, SENSOR_NOISE = 2.5, 0.4, 0.2
 """True values of the simulated log: time at which the heater is switched off (h), loss rate (1/h), noise (K)."""
 
 
@@ -42,8 +42,8 @@ def heater_problem() -> Problem:
     array([2.5, 0.4])
     """
     times = np.linspace(0.25, 6.0, 24)
-    noise = NOISE * np.random.default_rng(0).normal(size=len(times))
-    log = Measurements(times, _temperature(times) + noise, sigma=NOISE, names=("thermometer",))
+    noise = SENSOR_NOISE * np.random.default_rng(0).normal(size=len(times))
+    log = Measurements(times, _temperature(times) + noise, sigma=SENSOR_NOISE, names=("thermometer",))
     system = HybridSystem({"on": _on, "off": _off}, [0.0], state_names=("T",), state_units=("K",))
     parameters = {
         "k": Parameter(0.5, lower=0.01, upper=5.0, unit="1/h"),

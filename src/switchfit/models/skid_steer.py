@@ -1,4 +1,4 @@
-"""Skid-steered vehicles: that of Miller and Murphey, equation (18), and the same with axles that slip one by one."""
+"""Skid-steered vehicles after Miller and Murphey, equation (18): axles stick or slip, together or one by one."""
 
 from __future__ import annotations
 
@@ -11,30 +11,24 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import (
-    Constant,
-    Constants,
-    Values,
-    check_constants,
-    check_length,
-    check_modes,
-    is_absent,
-    read_input,
-)
+from switchfit.models.arguments import check_length, check_modes, read_input
+from switchfit.models.constants import Constant, Constants, Values, check_constants, is_absent
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.validation import as_choice, as_finite, as_flag, shorten
+from switchfit.problem.validation.arrays import as_finite
+from switchfit.problem.validation.messages import shorten
+from switchfit.problem.validation.names import as_choice
+from switchfit.problem.validation.objects import as_flag
 
 WheelForces = tuple[float, float, float, float]
 
-STUCK: Mapping[str, tuple[int, ...]] = {"stick": (1, -1), "front_slip": (-1,), "rear_slip": (1,), "slip": ()}
+STUCK_AXLES: Mapping[str, tuple[int, ...]] = {"stick": (1, -1), "front_slip": (-1,), "rear_slip": (1,), "slip": ()}
 """Axles that cannot move sideways in each mode: 1 is the one in front, -1 the one behind."""
 
 FRICTIONS: Mapping[int, tuple[str, str]] = {1: ("mu_front", "coulomb_front"), -1: ("mu_rear", "coulomb_rear")}
 """Viscous and Coulomb's friction of each axle."""
 
-
-STATES: tuple[str, ...] = ("X", "dX", "Y", "dY", "theta", "dtheta")
-UNITS: tuple[str, ...] = ("m", "m/s", "m", "m/s", "rad", "rad/s")
+SKID_STEER_STATES: tuple[str, ...] = ("X", "dX", "Y", "dY", "theta", "dtheta")
+SKID_STEER_UNITS: tuple[str, ...] = ("m", "m/s", "m", "m/s", "rad", "rad/s")
 
 FORCES = ("F1", "F2", "F3", "F4 (N)")
 """Channels of the input: the driving forces of the wheels."""
@@ -182,26 +176,26 @@ def skid_steer(
     fields, resets = {}, {}
     for name in names:
         field: Any = _move_by_input if forces is None else partial(_move, forces[0 if name == "stick" else 1])
-        fields[name] = partial(field, STUCK[name], constants)
+        fields[name] = partial(field, STUCK_AXLES[name], constants)
     if restick == "reset":
         resets = {
-            (before, after): partial(_stop_axles, STUCK[after], constants)
+            (before, after): partial(_stop_axles, STUCK_AXLES[after], constants)
             for before, after in permutations(names, 2)
-            if not set(STUCK[after]) <= set(STUCK[before])
+            if not set(STUCK_AXLES[after]) <= set(STUCK_AXLES[before])
         }
     return HybridSystem(
         modes=fields,
-        initial_state=check_length(initial_state, STATES),
+        initial_state=check_length(initial_state, SKID_STEER_STATES),
         reset_maps=resets,
-        state_names=STATES,
-        state_units=UNITS,
+        state_names=SKID_STEER_STATES,
+        state_units=SKID_STEER_UNITS,
     )
 
 
 def _check_modes(modes: Sequence[str], restick: str) -> tuple[str, ...]:
-    names = check_modes(modes, STUCK)
+    names = check_modes(modes, STUCK_AXLES)
     as_choice(restick, "restick", ("continuous", "reset"))
-    single = [name for name in names if len(STUCK[name]) == 1]
+    single = [name for name in names if len(STUCK_AXLES[name]) == 1]
     if restick == "continuous" and single:
         raise ValueError(f"mode {single[0]!r}, in which one axle sticks, needs restick='reset'; got 'continuous'.")
     return names

@@ -28,7 +28,7 @@ from switchfit.modes.fitter import Fitted, Fitter, find_read
 from switchfit.modes.hunt import Improver, Pool, Sequences
 from switchfit.modes.result import Certifier, ModeEnding, ModeFit, ModeStatus, ModeWarning
 from switchfit.modes.schedule import Schedule, list_insertions, list_removals, list_substitutions, merge_neighbours
-from switchfit.problem.validation import as_number
+from switchfit.problem.validation.arrays import as_number
 from switchfit.strategy.beam import list_sample_times
 from switchfit.strategy.library import Library
 
@@ -37,6 +37,21 @@ ROUNDING = 1e-7
 
 ROUNDS = 4
 """Most times that all neighbours are looked at, each time those of a better sequence."""
+
+AMBIGUOUS = 2.0
+"""Difference of the criterion below which another sequence is about as good."""
+
+ALTERNATIVE = 10.0
+"""Difference of the criterion below which a sequence is an alternative."""
+
+AT_BOUND = 1e-6
+"""How much longer than its shortest duration a mode may be, as a part of it, to be at that bound."""
+
+UNLIKELY = 0.5
+"""Weight of the best below which all others together are as likely."""
+
+FEW_SAMPLES = 5
+"""Samples below which a mode may make up for an error of the model."""
 
 
 def list_neighbours(schedule: Schedule, library: Library) -> Iterator[Schedule]:
@@ -119,22 +134,6 @@ def _find_change(schedule: Schedule, changed: Schedule) -> tuple[str, float, flo
     first = next(k for k in range(len(middles)) if before[k] != after[k])
     span = list(takewhile(lambda k: after[k] == after[first] != before[k], range(first, len(middles))))
     return after[first], float(knots[first]), float(knots[span[-1] + 1])
-
-
-AMBIGUOUS = 2.0
-"""Difference of the criterion below which another sequence is about as good."""
-
-ALTERNATIVE = 10.0
-"""Difference of the criterion below which a sequence is an alternative."""
-
-AT_BOUND = 1e-6
-"""How much longer than its shortest duration a mode may be, as a part of it, to be at that bound."""
-
-UNLIKELY = 0.5
-"""Weight of the best below which all others together are as likely."""
-
-FEW_SAMPLES = 5
-"""Samples below which a mode may make up for an error of the model."""
 
 
 @dataclass(frozen=True)

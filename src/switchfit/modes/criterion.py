@@ -35,8 +35,9 @@ from typing import Literal
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime import special
 from switchfit.uncertainty.residuals import explain_all
 from switchfit.uncertainty.verdict import NEARLY_ALL
@@ -46,6 +47,23 @@ CRITERIA: tuple[CriterionName, ...] = ("bic", "mbic", "aicc", "cost")
 
 INFORMATION: tuple[CriterionName, ...] = ("bic", "mbic", "aicc")
 """Criteria that need a likelihood, and nothing but J."""
+
+UNEXPLAINED = 1e-6
+"""Probability of chi-square below which the data are not explained."""
+
+CORRELATED = 1e-9
+"""The same of correlated residuals, by Ljung and Box's statistic, whose tail is heavier than chi-square's: of 200,000
+series of 150 random numbers 2e-4 had a probability below 1e-6 at 20 lags."""
+
+WITHIN_NOISE = 0.1
+"""Root mean square of residuals, in units of sigma, below which it does not matter how they are correlated: data
+without noise leave errors of integration."""
+
+FAR = 5.0
+"""Robust standard deviations beyond which a residual is an outlier: of normal noise, one in two million is."""
+
+MEDIAN = 1.4826
+"""Standard deviation of normal noise, in units of the median of its absolute values."""
 
 
 @dataclass(frozen=True)
@@ -168,18 +186,6 @@ def compute_weights(criteria: Sequence[float] | FloatArray) -> FloatArray:
     return np.asarray(weights / weights.sum())
 
 
-UNEXPLAINED = 1e-6
-"""Probability of chi-square below which the data are not explained."""
-
-CORRELATED = 1e-9
-"""The same of correlated residuals, by Ljung and Box's statistic, whose tail is heavier than chi-square's: of 200,000
-series of 150 random numbers 2e-4 had a probability below 1e-6 at 20 lags."""
-
-WITHIN_NOISE = 0.1
-"""Root mean square of residuals, in units of sigma, below which it does not matter how they are correlated: data
-without noise leave errors of integration."""
-
-
 def is_far_from_noise(estimate: Estimate, score: Score) -> bool:
     """Return whether residuals are too correlated to be noise.
 
@@ -233,13 +239,6 @@ def measure_whiteness(estimate: Estimate) -> float:
     """
     found = [channel.whiteness for channel in estimate.residuals.channels if np.isfinite(channel.whiteness)]
     return min(1.0, min(found) * len(found)) if found else 1.0
-
-
-FAR = 5.0
-"""Robust standard deviations beyond which a residual is an outlier: of normal noise, one in two million is."""
-
-MEDIAN = 1.4826
-"""Standard deviation of normal noise, in units of the median of its absolute values."""
 
 
 def count_far(estimate: Estimate) -> int:

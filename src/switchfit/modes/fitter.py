@@ -27,28 +27,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.discretization.mesh import Arguments, Mesh
-from switchfit.engine.adaptive import refine_mesh_of_many
-from switchfit.engine.branches import has_corners
-from switchfit.engine.jax import JaxEngine
-from switchfit.engine.native.engine import (
-    FailedCheckError,
-    NativeEngine,
-    NativeExperiment,
-    native_experiment,
-    places_in_library,
-)
-from switchfit.engine.native.templates import Order
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.corners.branches import has_corners
+from switchfit.engine.jax.jax_engine import JaxEngine
+from switchfit.engine.native.library_places import places_in_library
+from switchfit.engine.native.native_engine import NativeEngine
+from switchfit.engine.native.native_experiment import FailedCheckError, NativeExperiment, native_experiment
+from switchfit.engine.native.sizes import Order
 from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.refinement import refine_mesh_of_many
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
 from switchfit.optimize import LinearConstraints, lapack
-from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.inspection import find_targets
 from switchfit.problem.problem import Problem
+from switchfit.problem.reads import find_targets
 from switchfit.problem.structure import Structure
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.strategy.library import Library, trace_transition
 from switchfit.strategy.starts import fit_briefly
+
+SEARCH_RTOL = 1e-6
+"""Integration tolerance of the search: J is right to a millionth, and a certified estimate follows on its own mesh."""
+
+Experiments = dict[Order, NativeExperiment | None]
+
+COLLAPSED = 1e-6
+"""Duration, as a part of the horizon, below which a mode is left out."""
+
+TOURS = 6
+"""Sequences at which the meshes are refined, so that each mode is met in all parts of the horizon."""
 
 
 def find_read(problem: Problem, structures: Iterable[Structure], *, library: bool) -> NDArray[np.bool_]:
@@ -68,10 +76,6 @@ def find_read(problem: Problem, structures: Iterable[Structure], *, library: boo
     for states in unknowns.initial_states:
         found[states[states >= 0]] = True
     return found[int(unknowns.is_time.sum()) :]
-
-
-SEARCH_RTOL = 1e-6
-"""Integration tolerance of the search: J is right to a millionth, and a certified estimate follows on its own mesh."""
 
 
 def build_library_problem(problem: Problem, library: Library) -> Problem:
@@ -113,9 +117,6 @@ def _choose_schedule(run: Experiment, library: Library) -> Schedule:
     )
 
 
-Experiments = dict[Order, NativeExperiment | None]
-
-
 class SharedEngine(NativeEngine):
     """Evaluates one sequence of a library in an experiment that other sequences use too.
 
@@ -139,13 +140,6 @@ class SharedEngine(NativeEngine):
         if found is not None and found.structure is not self._structure:
             found.assign_sequence(self._structure, places_in_library(self._structure))
         return found
-
-
-COLLAPSED = 1e-6
-"""Duration, as a part of the horizon, below which a mode is left out."""
-
-TOURS = 6
-"""Sequences at which the meshes are refined, so that each mode is met in all parts of the horizon."""
 
 
 @dataclass(frozen=True, eq=False)

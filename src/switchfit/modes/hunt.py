@@ -39,7 +39,7 @@ from switchfit.modes.schedule import (
     splice,
     spread,
 )
-from switchfit.problem.data import FloatArray
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.progress import show_detail
 from switchfit.strategy.beam import Proposal
 from switchfit.strategy.hops import choose_hops, is_lower
@@ -49,6 +49,64 @@ EXPLAINED = 1e-3
 """Probability of chi-square above which the data are explained, and no further start is needed."""
 
 Sequences = tuple[tuple[str, ...], ...]
+
+LOWER = 1e-6
+"""A criterion has to fall by this part of itself, or by this much if it is small, for a move to count."""
+
+FITTED_MOVES = 3
+"""Moves of a kind that are fitted, those of the lowest simulated cost, each of another sequence."""
+
+FITTED_PROPOSALS = 3
+"""Proposals of a generator that are fitted for each run."""
+
+FITTED_REMOVALS = 2
+"""Removals that are fitted for each number of switches below the best; one where the data are explained: it is then for
+the table alone."""
+
+PLACES = (0.25, 0.5, 0.75)
+"""Places between its neighbours, as parts of the distance, to which a transition is moved."""
+
+FAR = 20.0
+"""Difference of the criterion from the best, by the quadratic model, above which a move is not fitted."""
+
+ROUNDS = 12
+"""Most rounds of moves."""
+
+CHAIN = 8
+"""Switches below the best down to which the table by number of switches is filled, for several runs."""
+
+ListMoves = Callable[[Schedule, Library], Iterable[Schedule]]
+
+MOVES: tuple[tuple[ListMoves, str, bool], ...] = (
+    (list_removals, "removal of modes", True),
+    (list_substitutions, "replacement of modes", True),
+    (list_insertions, "insertion of modes", False),
+)
+"""Kinds of moves in the order of what they cost, and whether only those are fitted that the model does not rule out."""
+
+LENGTHS = (0.02, 0.1)
+"""Lengths of the pulses that are proposed, as parts of the horizon."""
+
+LEFT = 0.25
+"""Part of the interrupted mode that a pulse leaves at least."""
+
+MINIMA = 3
+"""Local minima of the rate of each mode at which pulses are proposed."""
+
+FITTED = 8
+"""Proposals that are fitted from one schedule."""
+
+REMOVED_FROM = 1
+"""How many of these fits, the lowest ones, are repeated without each of their modes."""
+
+PATIENCE_WITH_PULSES = 2
+"""Schedules in a row from which no insertion leads to a lower J + switch_cost N, after which the search ends."""
+
+FACTORS = (0.7, 1.4)
+"""By which a guess without a prior is multiplied."""
+
+MOST_ALONE = 4
+"""Parameters up to which each is changed alone too."""
 
 
 class Pool:
@@ -134,42 +192,6 @@ class Pool:
     def measure_probability(self, fitted: Fitted) -> float:
         """Return the probability of chi-square at its cost, NaN where 2 J has no such distribution."""
         return self.score.measure_probability(fitted.cost, int(fitted.acting.sum()) + fitted.free_switches)
-
-
-LOWER = 1e-6
-"""A criterion has to fall by this part of itself, or by this much if it is small, for a move to count."""
-
-FITTED_MOVES = 3
-"""Moves of a kind that are fitted, those of the lowest simulated cost, each of another sequence."""
-
-FITTED_PROPOSALS = 3
-"""Proposals of a generator that are fitted for each run."""
-
-FITTED_REMOVALS = 2
-"""Removals that are fitted for each number of switches below the best; one where the data are explained: it is then for
-the table alone."""
-
-PLACES = (0.25, 0.5, 0.75)
-"""Places between its neighbours, as parts of the distance, to which a transition is moved."""
-
-FAR = 20.0
-"""Difference of the criterion from the best, by the quadratic model, above which a move is not fitted."""
-
-ROUNDS = 12
-"""Most rounds of moves."""
-
-CHAIN = 8
-"""Switches below the best down to which the table by number of switches is filled, for several runs."""
-
-
-ListMoves = Callable[[Schedule, Library], Iterable[Schedule]]
-
-MOVES: tuple[tuple[ListMoves, str, bool], ...] = (
-    (list_removals, "removal of modes", True),
-    (list_substitutions, "replacement of modes", True),
-    (list_insertions, "insertion of modes", False),
-)
-"""Kinds of moves in the order of what they cost, and whether only those are fitted that the model does not rule out."""
 
 
 class Move(NamedTuple):
@@ -345,25 +367,6 @@ class Improver:
             self.polish(self.place(fitted, move.e, move.schedule), fitted.parameters, "fits with fewer switches")
 
 
-LENGTHS = (0.02, 0.1)
-"""Lengths of the pulses that are proposed, as parts of the horizon."""
-
-LEFT = 0.25
-"""Part of the interrupted mode that a pulse leaves at least."""
-
-MINIMA = 3
-"""Local minima of the rate of each mode at which pulses are proposed."""
-
-FITTED = 8
-"""Proposals that are fitted from one schedule."""
-
-REMOVED_FROM = 1
-"""How many of these fits, the lowest ones, are repeated without each of their modes."""
-
-PATIENCE_WITH_PULSES = 2
-"""Schedules in a row from which no insertion leads to a lower J + switch_cost N, after which the search ends."""
-
-
 def list_pulses(
     fitter: Fitter, schedules: Sequence[Schedule], parameters: FloatArray
 ) -> list[tuple[float, list[Schedule]]]:
@@ -439,13 +442,6 @@ def _insert_and_fit(improver: Improver, current: Fitted) -> None:
         for e, schedule in enumerate(end.schedules):
             for without in list_removals(schedule, improver.library):
                 improver.polish(improver.place(end, e, without), end.parameters, "insertion")
-
-
-FACTORS = (0.7, 1.4)
-"""By which a guess without a prior is multiplied."""
-
-MOST_ALONE = 4
-"""Parameters up to which each is changed alone too."""
 
 
 def propose_starts(fitter: Fitter) -> list[FloatArray]:

@@ -26,13 +26,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.engine.protocol import Costates
+from switchfit.engine.simulation import Costates
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory, compare
-from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.validation import as_count, as_instance
+from switchfit.problem.validation.arrays import FloatArray, as_count
+from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.presentation import Printed, draw_figure, format_line
 
 

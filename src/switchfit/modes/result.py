@@ -21,14 +21,19 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.modes.fitter import Fitted, build_library_problem
 from switchfit.modes.schedule import Schedule, keep_off, spread
-from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
-from switchfit.runtime.files import from_json, read_document, to_json, write_document
+from switchfit.problem.validation.arrays import FloatArray, as_array, as_index
+from switchfit.problem.validation.messages import join_names
+from switchfit.problem.validation.objects import as_instance, as_path
+from switchfit.runtime.json_documents import read_document, write_document
+from switchfit.runtime.json_records import from_json, to_json
 from switchfit.runtime.presentation import Displayed, Printed, draw_figure, format_line
 from switchfit.strategy.known_order import fix_unknowns
 from switchfit.strategy.library import Library
+
+FORMAT = "switchfit modes"
+VERSION = 5
 
 
 class ModeStatus(Enum):
@@ -235,10 +240,6 @@ class Certifier:
     def find(self, sequences: tuple[tuple[str, ...], ...]) -> Estimate | None:
         """Return the estimate of some sequences; None if it has not been made."""
         return self._estimates.get(sequences)
-
-
-FORMAT = "switchfit modes"
-VERSION = 5
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,21 +30,12 @@ from switchfit.modes.fitter import Fitter
 from switchfit.modes.hunt import Improver, Pool, insert_modes, propose_starts
 from switchfit.modes.result import Certifier, ModeEnding, ModeSearch, ModeStatus, ModeWarning
 from switchfit.modes.schedule import Schedule
-from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem, require_samples
-from switchfit.problem.validation import (
-    as_array,
-    as_callable,
-    as_choice,
-    as_count,
-    as_finite,
-    as_instance,
-    as_positive,
-    as_seed,
-    join_names,
-    shorten,
-)
+from switchfit.problem.validation.arrays import FloatArray, as_array, as_count, as_finite, as_positive, as_seed
+from switchfit.problem.validation.messages import join_names, shorten
+from switchfit.problem.validation.names import as_choice
+from switchfit.problem.validation.objects import as_callable, as_instance
 from switchfit.runtime.progress import show_detail, show_line
 from switchfit.strategy.beam import REPLAYS, Beam, Proposal, Quadratic, prepare
 from switchfit.strategy.known_order import Beams
@@ -58,7 +49,6 @@ MOST_PLACES = 1_000_000
 WORST_DISPERSION = 4.0
 """Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model
 Selection and Multimodel Inference, 2002, section 2.5)."""
-
 
 Method = Literal["auto", "beam", "insertion"]
 METHODS: tuple[Method, ...] = get_args(Method)

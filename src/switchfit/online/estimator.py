@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.engine.protocol import Hypotheses
+from switchfit.engine.hypotheses import Hypotheses
 from switchfit.estimation.estimator import Estimate
 from switchfit.online.state import Alarm, Best, Now, OnlineStatus, build_kept_problem, calibrate, hold, read_sigma
 from switchfit.online.tracker import (
@@ -40,22 +40,21 @@ from switchfit.online.tracker import (
     read_journal,
     shift_cubic,
 )
-from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial
+from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import (
+from switchfit.problem.signals import PiecewisePolynomial
+from switchfit.problem.validation.arrays import (
+    FloatArray,
     as_array,
     as_count,
     as_finite,
     as_index,
-    as_instance,
-    as_names,
     as_number,
-    as_path,
     as_positive,
-    join_names,
-    require_known,
-    shorten,
 )
+from switchfit.problem.validation.messages import join_names, shorten
+from switchfit.problem.validation.names import as_names, require_known
+from switchfit.problem.validation.objects import as_instance, as_path
 from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import Beam
@@ -75,7 +74,6 @@ DRIFT_AFTER = 0.1
 LONGEST_GAP, MOST_BETWEEN = 1.5, 50
 """Time between samples, as a multiple of the usual one, above which nodes are put between: changes happen there, too;
 and how many at most."""
-
 
 CORNERS = (
     "the steps of updates do not end there, and errors of what acts there, as a friction, come out too small. "

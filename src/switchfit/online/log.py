@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.online.estimator import OnlineEstimator
 from switchfit.online.state import Alarm, Now, OnlineStatus, list_updates
-from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.dates import Origin
+from switchfit.problem.measurements import Measurements
+from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_callable, as_instances
+from switchfit.problem.validation.arrays import FloatArray, as_array
+from switchfit.problem.validation.objects import as_callable, as_instances
 from switchfit.runtime.presentation import Printed, draw_figure, format_line
 
 

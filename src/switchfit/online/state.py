@@ -20,11 +20,26 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import compare
 from switchfit.modes.schedule import Schedule, drop_empty
 from switchfit.online.tracker import Start, drop_artificial, invert
-from switchfit.problem.data import FloatArray, Input, Measurements
+from switchfit.problem.inputs import Input
+from switchfit.problem.measurements import Measurements
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_count, as_number, as_positive, shorten
+from switchfit.problem.validation.arrays import FloatArray, as_count, as_number, as_positive
+from switchfit.problem.validation.messages import shorten
 from switchfit.runtime.presentation import format_line
+
+NEVER = 100.0
+"""Threshold in the simulations, which their statistics do not reach."""
+
+EXCESS = 1.179
+"""Mean of M - m over the runs whose maximum M exceeds the median m, where the rate falls as exp(-(h - m)): the integral
+of ``2 (1 - exp(-u)) / u`` from 0 to log 2."""
+
+ENTRIES, STATES = "state at the start of the window", "initial state"
+"""Names of the parameters that stand for what is before a window."""
+
+NO_EFFECT = 1e-12
+"""Part of the largest second derivative below which one counts as none."""
 
 
 class OnlineStatus(Enum):
@@ -227,14 +242,6 @@ class Now:
         return np.array([*self.past_errors, *np.sqrt(np.diag(self._unknowns))[self.best.times]])
 
 
-NEVER = 100.0
-"""Threshold in the simulations, which their statistics do not reach."""
-
-EXCESS = 1.179
-"""Mean of M - m over the runs whose maximum M exceeds the median m, where the rate falls as exp(-(h - m)): the integral
-of ``2 (1 - exp(-u)) / u`` from 0 to log 2."""
-
-
 class Calibration(NamedTuple):
     """The threshold for a rate of false alarms.
 
@@ -409,13 +416,6 @@ def hold(inputs: Input, times: FloatArray, values: FloatArray) -> Input:
     """Return inputs like those of an experiment that hold values (K, q) from times (K,) on."""
     names = inputs.names
     return Input(times, dict(zip(names, values.T, strict=True)) if names else values.reshape(-1, *inputs.shape))
-
-
-ENTRIES, STATES = "state at the start of the window", "initial state"
-"""Names of the parameters that stand for what is before a window."""
-
-NO_EFFECT = 1e-12
-"""Part of the largest second derivative below which one counts as none."""
 
 
 def build_kept_problem(

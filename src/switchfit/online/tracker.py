@@ -33,11 +33,39 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.native.hypotheses import NativeHypotheses
-from switchfit.engine.protocol import Column, Hypotheses, Limits
-from switchfit.problem.data import FloatArray
+from switchfit.engine.hypotheses import Column, Hypotheses, HypothesisLimits
+from switchfit.engine.native.native_hypotheses import NativeHypotheses
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.strategy.beam import Beam, Pass
 from switchfit.strategy.library import Integers, Rules, Sequences, encode, select_lowest
+
+NO_EFFECT = 1e-13
+"""Singular value, relative to the largest, below which a combination of unknowns does not move the state."""
+
+KEPT = 32
+"""Nodes whose hypotheses are kept, to go on from them where a sample comes late."""
+
+ALWAYS = 2
+"""Hypotheses that are kept whatever their value: with what was declared, and without its last change."""
+
+PER_SEQUENCE = 8
+"""Hypotheses with the same sequence that are kept, at most. Of fewer, those that fit the noise of the last second best
+leave no room for a change that begins."""
+
+CERTAIN = 200.0
+"""Rise of 2 J without a change from which on it is not looked at anew: what is not fitted anew is too high by less."""
+
+LONGEST_APART = 2.0
+"""How far a transition time of two hypotheses may differ, in times between samples, where it leaves the window."""
+
+REPEATED = 12
+"""Hypotheses that go on where all are propagated anew over the window: parameters get new values, or a sample comes so
+late that the hypotheses at the node before it are not kept."""
+
+NOTHING = 1e-9
+"""Part of the artificial terms of H below which what is left without them is rounding."""
+
+FORMAT = "switchfit online 4"
 
 
 class Feed:
@@ -158,10 +186,6 @@ def shift_cubic(coefficients: FloatArray, s: float) -> FloatArray:
     """Return the coefficients (4, S) of cubics in the time since a moment that is s later."""
     c0, c1, c2, c3 = coefficients
     return np.stack([c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3])
-
-
-NO_EFFECT = 1e-13
-"""Singular value, relative to the largest, below which a combination of unknowns does not move the state."""
 
 
 class Start(NamedTuple):
@@ -304,30 +328,6 @@ class Past(NamedTuple):
         found.tangents[..., free] = 0.0
         found.moved[:] = self.turn(np.array(found.moved))
         found.moved[:, free] = 0.0
-
-
-KEPT = 32
-"""Nodes whose hypotheses are kept, to go on from them where a sample comes late."""
-
-ALWAYS = 2
-"""Hypotheses that are kept whatever their value: with what was declared, and without its last change."""
-
-PER_SEQUENCE = 8
-"""Hypotheses with the same sequence that are kept, at most. Of fewer, those that fit the noise of the last second best
-leave no room for a change that begins."""
-
-CERTAIN = 200.0
-"""Rise of 2 J without a change from which on it is not looked at anew: what is not fitted anew is too high by less."""
-
-LONGEST_APART = 2.0
-"""How far a transition time of two hypotheses may differ, in times between samples, where it leaves the window."""
-
-REPEATED = 12
-"""Hypotheses that go on where all are propagated anew over the window: parameters get new values, or a sample comes so
-late that the hypotheses at the node before it are not kept."""
-
-NOTHING = 1e-9
-"""Part of the artificial terms of H below which what is left without them is rounding."""
 
 
 class StoppedError(ValueError):
@@ -521,14 +521,14 @@ class Tracker:
                 chosen = np.append(chosen, same[value[same].argsort(kind="stable")[:1]])
         return chosen
 
-    def _build_limits(self) -> Limits:
+    def _build_limits(self) -> HypothesisLimits:
         """Return how far times and parameters may move; what is before the window may move anywhere."""
         low, high, most = self._pass.build_limits()
         reach = np.full(self.beam.births, self.spacing)
         reach[: self.settings.entries] = np.inf
         for values, sign in ((low, -1.0), (high, 1.0), (most, 1.0)):
             values[: len(reach)] = sign * reach
-        return Limits(low, high, most)
+        return HypothesisLimits(low, high, most)
 
     # --- over the window -------------------------------------------------------------------------------------------
 
@@ -763,9 +763,6 @@ def invert(matrix: FloatArray) -> FloatArray:
     diagonal = np.diag(found)
     np.fill_diagonal(found, np.where(diagonal > 0, diagonal, np.inf))
     return found
-
-
-FORMAT = "switchfit online 4"
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:

@@ -16,37 +16,52 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
+
 Array = Any
 """An array of NumPy or of JAX."""
 
 EPS = float(np.finfo(np.float64).eps)
+
 #: Eigenvalues of the diagonally scaled Hessian below this count as zero.
 EIGENVALUE_FLOOR = 1e-10
+
 #: What such an eigenvalue is replaced by in the quadratic programme: small, but steps along it stay within reason.
 EIGENVALUE_REPLACEMENT = 1e-4
+
 #: Fraction of the predicted linear decrease that a step must achieve (Armijo).
 ARMIJO = 1e-4
+
 #: The same for a step across a breakpoint, where the prediction may be wrong however short the step.
 ARMIJO_ACROSS = 0.1
+
 #: The same for steepest descent.
 ARMIJO_DESCENT = 0.4
+
 #: Differences of costs below this part of the cost say nothing: where residuals are small beside what is measured, the
 #: rounding of a sum of their squares is a few hundred units, and a search by costs takes many short steps at the end.
-NOISE = 4096 * EPS
+COST_NOISE = 4096 * EPS
+
 #: A step below this part of the unknowns' size is negligible.
 NEGLIGIBLE_STEP = 1e-10
+
 #: Iterations spent on making the last step negligible once the optimality is below the tolerance.
 EXTRA_ITERATIONS = 5
+
 #: Newton steps up to this multiple of the unknowns' size are never shortened by changing the Hessian.
 LONGEST_STEP = 1e3
+
 #: Sizes below this count as unknown: their squares vanish.
-SMALLEST = 1e-150
+SMALLEST_KNOWN_SIZE = 1e-150
+
 #: Steps are tried inside the present smooth piece where they cross fewer breakpoints than this.
 MANY_BREAKPOINTS = 3
+
 #: Smaller jumps of a derivative, beside the largest one seen, are rounding.
 SMALLEST_JUMP = 1e-12
+
 #: Rounds of equilibration after which the scaling of an indefinite matrix is good enough.
 EQUILIBRATIONS = 20
+
 #: Largest entry of a row with which equilibration ends.
 EQUILIBRATED = 1.0 + 1e-9
 
@@ -138,7 +153,7 @@ def flatness(scale: Array, cost_scale: Array, xp: Any = np) -> Array:
     cost_scale : float
         Size of J.
     """
-    size = _replace_small(scale, SMALLEST, xp.inf, xp)
+    size = _replace_small(scale, SMALLEST_KNOWN_SIZE, xp.inf, xp)
     return (EPS * cost_scale) / (size * size)
 
 
@@ -191,7 +206,7 @@ def find_least_jump(curvature: Array, slopes: Any, cost: Any, xp: Any = np) -> A
     slopes, cost : float
         The largest derivative seen, and J.
     """
-    return xp.maximum(SMALLEST_JUMP * slopes, xp.sqrt(2.0 * NOISE * xp.abs(cost) * xp.fmax(curvature, 0.0)))
+    return xp.maximum(SMALLEST_JUMP * slopes, xp.sqrt(2.0 * COST_NOISE * xp.abs(cost) * xp.fmax(curvature, 0.0)))
 
 
 def choose_sides(left: Array, right: Array, xp: Any = np) -> Array:

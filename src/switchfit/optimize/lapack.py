@@ -1,4 +1,4 @@
-"""The functions of `scipy.linalg.lapack`, which is imported at the first use of one: ``lapack.dpotrf(matrix)``.
+"""Functions of `scipy.linalg.lapack`, which is imported at the first call: ``lapack.dpotrf(matrix)``.
 
 To import it takes as long as a hundred fits, and an evaluation does not need it.
 """

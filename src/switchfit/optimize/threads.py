@@ -20,12 +20,17 @@ from typing import ParamSpec, TypeVar
 P = ParamSpec("P")
 R = TypeVar("R")
 
-MODULES = "numpy.linalg._umath_linalg", "scipy.linalg._flapack"
+BLAS_MODULES = "numpy.linalg._umath_linalg", "scipy.linalg._flapack"
 """Extension modules that are linked with the BLAS of NumPy and of SciPy."""
-
 
 Library = tuple[Callable[[], int], Callable[[int], None]]
 """Functions that read and set the number of threads of one BLAS."""
+
+_lock = threading.Lock()
+_inside = 0
+
+_before: list[tuple[Callable[[int], None], int]] = []
+"""How many threads are inside the optimizer, and the caller's settings while there are any."""
 
 
 @cache
@@ -36,7 +41,7 @@ def find_libraries() -> tuple[Library, ...]:
     yet: the optimizer needs it in any case.
     """
     found = []
-    for name in MODULES:
+    for name in BLAS_MODULES:
         with suppress(ImportError, OSError, TypeError):  # a build without this module, or with it in the interpreter
             module = ctypes.CDLL(import_module(name).__file__)
             for affixes in ("scipy_{}64_", "scipy_{}", "{}64_", "{}"):
@@ -45,12 +50,6 @@ def find_libraries() -> tuple[Library, ...]:
                     found.append((getattr(module, get), getattr(module, put)))
                     break
     return tuple(found)
-
-
-_lock = threading.Lock()
-_inside = 0
-_before: list[tuple[Callable[[int], None], int]] = []
-"""How many threads are inside the optimizer, and the caller's settings while there are any."""
 
 
 def _count(change: int) -> None:

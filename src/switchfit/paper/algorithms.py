@@ -20,16 +20,18 @@ from jax.scipy.linalg import expm
 
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
-from switchfit.optimize.problem import HessianKind
+from switchfit.optimize.minimization_problem import HessianKind
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, LIGHT, RED, Figure, Found, Row, Say
-from switchfit.problem.data import FloatArray, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
+from switchfit.problem.reference_signals import ReferenceSignal
 from switchfit.problem.system import HybridSystem
+from switchfit.problem.validation.arrays import FloatArray
 
 KINDS: tuple[HessianKind, ...] = ("none", "block-diagonal", "exact", "descent-first")
+
 LOOKS: dict[str, dict[str, Any]] = {
     "none": {"label": "steepest descent", "color": LIGHT, "linestyle": "-"},
     "block-diagonal": {"label": "SQP: block-diagonal Hessian", "color": BLUE, "linestyle": "--"},
@@ -37,9 +39,40 @@ LOOKS: dict[str, dict[str, Any]] = {
     "descent-first": {"label": "paper's: descent, then exact", "color": DARK, "linestyle": ":"},
 }
 
-
 #: Largest number of points of a history that are drawn.
 DRAWN = 300
+
+CONVERGENCE_LINES = """
+* Fig. 4: values found (mu; tau) | (0.7; 6, 10), the correct ones
+| ({exact[theta][mu]:.4f}; {exact[theta][tau_1]:.4f}, {exact[theta][tau_2]:.4f})
+* Fig. 4: iterations of steepest descent to ‖DJ‖ < 1e-7 | about 1000 | {steepest[iterations]}
+| {ratio:.0f} times those with the exact Hessian; in the metric of (s, s, 1) as given, steps halved from 1 until 0.4 of
+the predicted decrease is reached (the paper does not print its line search, and the count depends on it)
+* Fig. 4: iterations with the block-diagonal Hessian | not quadratic
+| {block[iterations]}, linear: a factor of {factor:.3f} each
+* Fig. 4: iterations with the exact Hessian | 12 | {exact[iterations]}, order {order:.2f}
+| the Hessian is made positive definite where it is not, instead of descending first
+* Section II-A: descent until the Hessian is positive definite, then SQP | 12 (the same)
+| {first[iterations]}, of which {descents} descents | smallest eigenvalue at the start {eigenvalues_at_start[0]:.1f}
+* Fig. 4: second-order sufficient conditions | not printed | {conditions}
+"""
+
+#: tau (s), stiffness k (1/s²), damping c (1/s).
+LTI_TRUTH, LTI_START = (4.0, 2.0, 1.0), (3.5, 1.8, 0.6)
+
+LTI_HORIZON = 10.0
+LTI_INITIAL = (1.0, 0.0)
+LTI_KINDS: tuple[HessianKind, ...] = ("none", "block-diagonal", "exact")
+
+LTI_LINES = """
+* LTI: the correct values are found | converges to the correct values | largest error {error:.0e}
+| tau 4 s, k 2, c 1 from (3.5, 1.8, 0.6)
+* LTI: J, DJ, D²J against matrix exponentials | not printed
+| relative gaps {gaps[0]:.0e}, {gaps[1]:.0e}, {gaps[2]:.0e} | the reference is a spline through exact samples
+* LTI: iterations to ‖DJ‖ < 1e-7 (steepest descent, block-diagonal, exact) | far fewer with the exact Hessian
+| {fits[none][iterations]}, {fits[block-diagonal][iterations]}, {fits[exact][iterations]}
+* LTI: second-order sufficient conditions | not printed | {conditions}
+"""
 
 
 def fit_kinds(problem: Problem, kinds: Sequence[HessianKind], say: Say) -> dict[str, Found]:
@@ -100,22 +133,6 @@ def factor(history: list[list[float]]) -> float:
     return float((norms[-1] / norms[middle]) ** (1 / (iterations[-1] - iterations[middle])))
 
 
-CONVERGENCE_LINES = """
-* Fig. 4: values found (mu; tau) | (0.7; 6, 10), the correct ones
-| ({exact[theta][mu]:.4f}; {exact[theta][tau_1]:.4f}, {exact[theta][tau_2]:.4f})
-* Fig. 4: iterations of steepest descent to ‖DJ‖ < 1e-7 | about 1000 | {steepest[iterations]}
-| {ratio:.0f} times those with the exact Hessian; in the metric of (s, s, 1) as given, steps halved from 1 until 0.4 of
-the predicted decrease is reached (the paper does not print its line search, and the count depends on it)
-* Fig. 4: iterations with the block-diagonal Hessian | not quadratic
-| {block[iterations]}, linear: a factor of {factor:.3f} each
-* Fig. 4: iterations with the exact Hessian | 12 | {exact[iterations]}, order {order:.2f}
-| the Hessian is made positive definite where it is not, instead of descending first
-* Section II-A: descent until the Hessian is positive definite, then SQP | 12 (the same)
-| {first[iterations]}, of which {descents} descents | smallest eigenvalue at the start {eigenvalues_at_start[0]:.1f}
-* Fig. 4: second-order sufficient conditions | not printed | {conditions}
-"""
-
-
 def list_convergence(found: Found) -> list[Row]:
     """Return the lines of the table."""
     steepest, block, exact, first = (found["fits"][kind] for kind in KINDS)
@@ -123,13 +140,6 @@ def list_convergence(found: Found) -> list[Row]:
     rates = {"factor": factor(block["history"]), "order": order(exact["history"])}
     ratio, conditions = steepest["iterations"] / exact["iterations"], vehicle.conditions(exact)
     return vehicle.fill_rows(CONVERGENCE_LINES, ratio=ratio, conditions=conditions, **fits, **rates, **found)
-
-
-#: tau (s), stiffness k (1/s²), damping c (1/s).
-LTI_TRUTH, LTI_START = (4.0, 2.0, 1.0), (3.5, 1.8, 0.6)
-LTI_HORIZON = 10.0
-LTI_INITIAL = (1.0, 0.0)
-LTI_KINDS: tuple[HessianKind, ...] = ("none", "block-diagonal", "exact")
 
 
 def build_oscillator(start: tuple[float, float, float] = LTI_START) -> Problem:
@@ -217,17 +227,6 @@ def compute_lti(quick: bool, say: Say) -> Found:
 def draw_lti(found: Found) -> dict[str, Figure]:
     """Draw the gradient norm against iteration."""
     return {"lti": convergence_figure(found["fits"])}
-
-
-LTI_LINES = """
-* LTI: the correct values are found | converges to the correct values | largest error {error:.0e}
-| tau 4 s, k 2, c 1 from (3.5, 1.8, 0.6)
-* LTI: J, DJ, D²J against matrix exponentials | not printed
-| relative gaps {gaps[0]:.0e}, {gaps[1]:.0e}, {gaps[2]:.0e} | the reference is a spline through exact samples
-* LTI: iterations to ‖DJ‖ < 1e-7 (steepest descent, block-diagonal, exact) | far fewer with the exact Hessian
-| {fits[none][iterations]}, {fits[block-diagonal][iterations]}, {fits[exact][iterations]}
-* LTI: second-order sufficient conditions | not printed | {conditions}
-"""
 
 
 def list_lti(found: Found) -> list[Row]:

@@ -17,18 +17,51 @@ from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, HORIZON, NAMES, PAGE, RED, SYMBOLS, TRUTH, Figure, Found, Row, Say, tidy
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.measurements import Measurements
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.choice import estimate, was_interrupted
 
 #: Standard deviations (m): variances of 0 to 0.25 m², more densely up to 0.25 m, the other reading of the paper's unit.
 LEVELS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
+
 QUICK_LEVELS = (0.0, 0.1, 0.25, 0.5)
 NOISE_RUNS, QUICK_NOISE_RUNS = 500, 50
 PERCENTILES = (5, 25, 50, 75, 95)
 TIMES = np.arange(HORIZON + 1)
+
 #: Standard deviation of positions (m) of which a sample or another may tell mu, and the longest horizon (s) of these.
 SIGMA, LONGEST = 0.1, 30.0
+
+NOISE_LINES = """
+* Fig. 5: error without noise | zero | bias of {bias} (tau_1 s, tau_2 s, mu)
+| from interpolating 1 Hz positions and filtering them at {lowpass:g} Hz
+* Fig. 5: mean normalised error at variance {variance:g} m² (%), from the truth
+| degrades gracefully; mu is the most sensitive | tau_1, tau_2, mu: {last_size}
+| {runs} runs a level, {last[converged]} converged
+* Fig. 5: the same at standard deviation 0.25 m, the other reading of the paper's unit (%) | | {quarter_size}
+* Fig. 5: rms normalised error from the noise-free estimate (%) | not printed | {from_noise_free} | from the truth {rms}
+"""
+
+SAMPLES_LINE = """
+* V-A 3: standard error of mu, 1 Hz positions {label} | effectively only four measurements affect it | {mu:.4f}
+| {samples} samples, {in_slip} of them in slip; sigma {sigma:g} m
+"""
+
+COUNT, QUICK_COUNT = 1000, 30
+LOWER_MU, UPPER_MU = 0.05, 2.0
+
+#: Estimates that agree to this part of the horizon, or to this difference of mu, count as one.
+SAME = 1e-3
+
+#: Number of estimates in the table, the most frequent ones.
+SHOWN = 4
+
+METHODS: dict[str, tuple[str, dict[str, Any]]] = {
+    "exact": ("one fit, exact Hessian", {"strategy": "local", "hessian": "exact"}),
+    "local": ("one fit, trust region", {"strategy": "local"}),
+    "auto": ('strategy "auto"', {"strategy": "auto"}),
+}
 
 
 def compute_noise(quick: bool, say: Say) -> Found:
@@ -100,22 +133,6 @@ def draw_noise(found: Found) -> dict[str, Figure]:
     return {"fig5-noise": figure}
 
 
-NOISE_LINES = """
-* Fig. 5: error without noise | zero | bias of {bias} (tau_1 s, tau_2 s, mu)
-| from interpolating 1 Hz positions and filtering them at {lowpass:g} Hz
-* Fig. 5: mean normalised error at variance {variance:g} m² (%), from the truth
-| degrades gracefully; mu is the most sensitive | tau_1, tau_2, mu: {last_size}
-| {runs} runs a level, {last[converged]} converged
-* Fig. 5: the same at standard deviation 0.25 m, the other reading of the paper's unit (%) | | {quarter_size}
-* Fig. 5: rms normalised error from the noise-free estimate (%) | not printed | {from_noise_free} | from the truth {rms}
-"""
-
-SAMPLES_LINE = """
-* V-A 3: standard error of mu, 1 Hz positions {label} | effectively only four measurements affect it | {mu:.4f}
-| {samples} samples, {in_slip} of them in slip; sigma {sigma:g} m
-"""
-
-
 def list_noise(found: Found) -> list[Row]:
     """Return the lines of the table."""
     sigma, levels = found["sigma"], found["levels"]
@@ -137,19 +154,6 @@ def list_noise(found: Found) -> list[Row]:
 
 def _list(values: Any, form: str) -> str:
     return ", ".join(format(value, form) for value in values)
-
-
-COUNT, QUICK_COUNT = 1000, 30
-LOWER_MU, UPPER_MU = 0.05, 2.0
-#: Estimates that agree to this part of the horizon, or to this difference of mu, count as one.
-SAME = 1e-3
-#: Number of estimates in the table, the most frequent ones.
-SHOWN = 4
-METHODS: dict[str, tuple[str, dict[str, Any]]] = {
-    "exact": ("one fit, exact Hessian", {"strategy": "local", "hessian": "exact"}),
-    "local": ("one fit, trust region", {"strategy": "local"}),
-    "auto": ('strategy "auto"', {"strategy": "auto"}),
-}
 
 
 def compute_starts(quick: bool, say: Say) -> Found:

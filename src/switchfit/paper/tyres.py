@@ -13,20 +13,77 @@ import numpy as np
 
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
-from switchfit.models.magic_formula import MAGIC_FORMULA
+from switchfit.models.tyre_forces import MAGIC_FORMULA
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, LIGHT, PAGE, RED, Figure, Found, Row, Say, tidy
-from switchfit.problem.data import Measurements
 from switchfit.problem.experiment import Parameter
+from switchfit.problem.measurements import Measurements
 from switchfit.report.style import MODE_COLOURS
 from switchfit.uncertainty.certificate import identifiability
 
 START = (5.0, 10.0, 0.8)
 SECONDS = np.arange(16.0)
+
 #: Eigenvalues below this part of the largest one are rounding.
 ROUNDING = 1e-15
+
 #: Times (s) in which the wheels reach and lose their difference of speed, which the paper does not print.
 RAMPS = ((0.6, 0.6), (0.6, 1.5), (0.6, 2.5), (0.6, 3.4), (1.5, 3.4), (3.4, 3.4), (3.4, 0.6))
+
+MAGIC_LINES = """
+* Fig. 3: tau_1 (s) | 5, the commanded change | {ours[tau_1]:.2f} (with reset {other[tau_1]:.2f})
+| commanded at 5 s, the wheels take {rise:g} s to follow
+* Fig. 3: tau_2 (s) | 11.7, later than the commanded 10 | {ours[tau_2]:.2f} (with reset {other[tau_2]:.2f})
+| delayed by {delay:.2f} s instead of 1.7 s: tyres of this stiffness stop turning within 0.1 s of the wheels, so the
+delay is that of the wheels ({rise:g} s)
+* Fig. 3: mu | 0.676; 0.6 to 0.85 on asphalt | {ours[mu]:.3f} (with reset {other[mu]:.3f})
+| mu of (18) sets the yaw rate, which the treads' difference of speed sets here (±{differential:g} m/s, a choice): 0.253
+rad/s / mu
+* Fig. 3: the reference is tracked well | by eye
+| {literal[rms_position_error]:.2f} m rms (with reset {reset[rms_position_error]:.2f} m)
+| taken literally, (18) keeps turning after it sticks again
+"""
+
+RAMP_LINE = """
+* Fig. 3: the wheels take {rise:g} s to turn and {fall:g} s to stop turning | not printed; finds 5, 11.7, 0.676
+| {theta[tau_1]:.2f}, {theta[tau_2]:.2f}, {theta[mu]:.3f} | tau_1, tau_2 (s), mu
+"""
+
+LAST_LINES = """
+* Fig. 3: optimality | necessary and sufficient conditions | {conditions}
+* V-A 1: Hessian in 16 Magic Formula coefficients | ill-conditioned
+| eigenvalues {eigenvalues[15]:.1e} to below rounding; {undetermined} of 16 combinations undetermined
+| positions at 10 Hz without noise, coefficients in units of their values; the identifiability analysis (scaled Hessian)
+says of one that it cannot be seen: {worst[0]}
+"""
+
+#: Standard deviation of GPS positions (m).
+GPS_SIGMA = 0.1
+
+#: Drive force of each wheel in stick (N), as in the paper, and the treads' difference of speed (m/s), which varies
+#: between the trials of the simulated vehicle.
+TRIALS = ((12.0, 0.170), (12.0, 0.166), (12.0, 0.178), (15.0, 0.172), (15.0, 0.160))
+
+#: Distance (m) between trials in the figure.
+SHIFT = 20.0
+
+LOOKS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("initial trajectory", {"color": LIGHT, "linewidth": 1.2}),
+    ("interpolated and filtered", {"color": "#666666", "linewidth": 1.6, "linestyle": "--"}),
+    ("optimal trajectory", {"color": DARK, "linewidth": 1.0}),
+    ("GPS at 1 Hz (simulated)", {"color": RED, "ls": "", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}),
+)
+
+TRIAL_LINE = """
+* Fig. 6, trial {number} (simulated log): tau_1, tau_2 (s), mu | values are in the figure only
+| {theta[tau_1]:.2f}, {theta[tau_2]:.2f}, {theta[mu]:.3f}
+| {iterations} iterations, ‖DJ‖ = {gradient_norm:.0e}, smallest eigenvalue of D²J {smallest_eigenvalue:.3g}
+"""
+
+TRIALS_LINE = """
+* Fig. 6 (simulated logs): all trials converge to ‖DJ‖ < 1e-7 in fewer than 15 iterations | yes
+| {answer}: at most {most} iterations, ‖DJ‖ at most {largest:.0e}
+"""
 
 
 def compute_magic(quick: bool, say: Say) -> Found:
@@ -108,34 +165,6 @@ def draw_magic(found: Found) -> dict[str, Figure]:
     return {"fig3-magic-formula": figure}
 
 
-MAGIC_LINES = """
-* Fig. 3: tau_1 (s) | 5, the commanded change | {ours[tau_1]:.2f} (with reset {other[tau_1]:.2f})
-| commanded at 5 s, the wheels take {rise:g} s to follow
-* Fig. 3: tau_2 (s) | 11.7, later than the commanded 10 | {ours[tau_2]:.2f} (with reset {other[tau_2]:.2f})
-| delayed by {delay:.2f} s instead of 1.7 s: tyres of this stiffness stop turning within 0.1 s of the wheels, so the
-delay is that of the wheels ({rise:g} s)
-* Fig. 3: mu | 0.676; 0.6 to 0.85 on asphalt | {ours[mu]:.3f} (with reset {other[mu]:.3f})
-| mu of (18) sets the yaw rate, which the treads' difference of speed sets here (±{differential:g} m/s, a choice): 0.253
-rad/s / mu
-* Fig. 3: the reference is tracked well | by eye
-| {literal[rms_position_error]:.2f} m rms (with reset {reset[rms_position_error]:.2f} m)
-| taken literally, (18) keeps turning after it sticks again
-"""
-
-RAMP_LINE = """
-* Fig. 3: the wheels take {rise:g} s to turn and {fall:g} s to stop turning | not printed; finds 5, 11.7, 0.676
-| {theta[tau_1]:.2f}, {theta[tau_2]:.2f}, {theta[mu]:.3f} | tau_1, tau_2 (s), mu
-"""
-
-LAST_LINES = """
-* Fig. 3: optimality | necessary and sufficient conditions | {conditions}
-* V-A 1: Hessian in 16 Magic Formula coefficients | ill-conditioned
-| eigenvalues {eigenvalues[15]:.1e} to below rounding; {undetermined} of 16 combinations undetermined
-| positions at 10 Hz without noise, coefficients in units of their values; the identifiability analysis (scaled Hessian)
-says of one that it cannot be seen: {worst[0]}
-"""
-
-
 def list_magic(found: Found) -> list[Row]:
     """Return the lines of the table."""
     literal, reset = found["fits"]["continuous"], found["fits"]["reset"]
@@ -147,21 +176,6 @@ def list_magic(found: Found) -> list[Row]:
         *(row for ramp in found["ramps"] for row in vehicle.fill_rows(RAMP_LINE, **ramp)),
         *vehicle.fill_rows(LAST_LINES, conditions=vehicle.conditions(literal), **found),
     ]
-
-
-#: Standard deviation of GPS positions (m).
-GPS_SIGMA = 0.1
-#: Drive force of each wheel in stick (N), as in the paper, and the treads' difference of speed (m/s), which varies
-#: between the trials of the simulated vehicle.
-TRIALS = ((12.0, 0.170), (12.0, 0.166), (12.0, 0.178), (15.0, 0.172), (15.0, 0.160))
-#: Distance (m) between trials in the figure.
-SHIFT = 20.0
-LOOKS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("initial trajectory", {"color": LIGHT, "linewidth": 1.2}),
-    ("interpolated and filtered", {"color": "#666666", "linewidth": 1.6, "linestyle": "--"}),
-    ("optimal trajectory", {"color": DARK, "linewidth": 1.0}),
-    ("GPS at 1 Hz (simulated)", {"color": RED, "ls": "", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}),
-)
 
 
 def compute_trials(quick: bool, say: Say) -> Found:
@@ -198,18 +212,6 @@ def draw_trials(found: Found) -> dict[str, Figure]:
     ax.set_title("Simulated logs (Magic Formula vehicle), equation (18) as printed", fontsize=8, loc="left")
     tidy(ax, f"X (m), each trial shifted by {SHIFT:g} m", "Y (m)")
     return {"fig6-trials": figure}
-
-
-TRIAL_LINE = """
-* Fig. 6, trial {number} (simulated log): tau_1, tau_2 (s), mu | values are in the figure only
-| {theta[tau_1]:.2f}, {theta[tau_2]:.2f}, {theta[mu]:.3f}
-| {iterations} iterations, ‖DJ‖ = {gradient_norm:.0e}, smallest eigenvalue of D²J {smallest_eigenvalue:.3g}
-"""
-
-TRIALS_LINE = """
-* Fig. 6 (simulated logs): all trials converge to ‖DJ‖ < 1e-7 in fewer than 15 iterations | yes
-| {answer}: at most {most} iterations, ‖DJ‖ at most {largest:.0e}
-"""
 
 
 def list_trials(found: Found) -> list[Row]:

@@ -15,12 +15,17 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.trajectory import Trajectory, simulate
-from switchfit.models.magic_formula import MAGIC_FORMULA, magic_formula
+from switchfit.models.magic_formula import magic_formula
 from switchfit.models.skid_steer import SLIP_FORCES, skid_steer
+from switchfit.models.tyre_forces import MAGIC_FORMULA
 from switchfit.optimize import Status
-from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal
+from switchfit.problem.data import Data
 from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.inputs import Input
+from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
+from switchfit.problem.reference_signals import ReferenceSignal
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.presentation import Axes
 from switchfit.runtime.presentation import Figure as Figure
 from switchfit.uncertainty.certificate import certify
@@ -30,14 +35,41 @@ Say = Callable[[str], None]
 
 #: Width of a figure over one and over two columns (inches).
 COLUMN, PAGE = 3.5, 7.16
+
 #: Dark, middle and light, so that they differ in gray too; lines also differ in their dashes.
 DARK, RED, BLUE, LIGHT = "#222222", "#b2182b", "#4a7fb5", "#b5b5b5"
+
 SYMBOLS = {"tau_1": r"$\tau_1$", "tau_2": r"$\tau_2$", "mu": r"$\mu$"}
 
 #: Length and width of a wheel as drawn (m).
 WHEEL = (0.22, 0.08)
+
 #: Heading as drawn (degrees), and length of the longest force (m).
 HEADING, LONGEST = 25.0, 0.34
+
+SEQUENCE = ("stick", "slip", "stick")
+NAMES = ("tau_1", "tau_2", "mu")
+
+#: Truth and start of the simulated problem, in the order of NAMES (s, s, 1).
+TRUTH, START = (6.0, 10.0, 0.7), (5.0, 9.0, 0.8)
+
+#: Horizon (s): the paper samples over 15 s.
+HORIZON = 15.0
+
+#: Cut-off (Hz) of the low-pass filter of 1 Hz positions; the paper gives none.
+LOWPASS_HZ = 0.3
+
+#: Times (s) of the commands to the wheels of the Magic Formula vehicle to turn and to stop turning, as in the paper.
+COMMANDED = (5.0, 10.0)
+
+#: Time (s) in which the wheels reach a commanded difference of speed.
+RISE = 0.6
+
+#: Speed (m/s) of the treads on one side above and on the other below the mean while it turns.
+DIFFERENTIAL = 0.17
+
+WHEEL_RADIUS = 0.15
+Restick = Literal["continuous", "reset"]
 
 
 class Row(NamedTuple):
@@ -84,26 +116,6 @@ def conditions(found: Found) -> str:
     if not found["sufficient"]:
         return "not satisfied"
     return f"satisfied: ‖DJ‖ = {found['gradient_norm']:.0e}, smallest eigenvalue {found['smallest_eigenvalue']:.3g}"
-
-
-SEQUENCE = ("stick", "slip", "stick")
-NAMES = ("tau_1", "tau_2", "mu")
-#: Truth and start of the simulated problem, in the order of NAMES (s, s, 1).
-TRUTH, START = (6.0, 10.0, 0.7), (5.0, 9.0, 0.8)
-#: Horizon (s): the paper samples over 15 s.
-HORIZON = 15.0
-#: Cut-off (Hz) of the low-pass filter of 1 Hz positions; the paper gives none.
-LOWPASS_HZ = 0.3
-
-#: Times (s) of the commands to the wheels of the Magic Formula vehicle to turn and to stop turning, as in the paper.
-COMMANDED = (5.0, 10.0)
-#: Time (s) in which the wheels reach a commanded difference of speed.
-RISE = 0.6
-#: Speed (m/s) of the treads on one side above and on the other below the mean while it turns.
-DIFFERENTIAL = 0.17
-WHEEL_RADIUS = 0.15
-
-Restick = Literal["continuous", "reset"]
 
 
 def position(t: Any, x: Any, p: Any) -> Any:

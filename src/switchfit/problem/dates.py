@@ -1,9 +1,7 @@
-"""Dates at the way in: what is given as dates becomes numbers of a time unit since an origin.
+"""Dates as they are given: text, datetimes and columns of tables, read as instants with a time zone.
 
 Everything inside the library computes with float64 numbers. Dates are read here (`read_dates`), kept to the microsecond
-until the experiment knows its origin and its unit, and then converted (`Origin.to_numbers`): the difference to the
-origin is exact before it is rounded once to float64, so that no digits go to the years since 1970. `Origin.to_dates` is
-the way back, for reports, figures and files.
+until the experiment knows its origin and its unit, and then converted (`switchfit.problem.origin`).
 
 A date has a time zone or has none. One without is the reading of some wall clock: it cannot be compared with one that
 has a zone until the experiment's `time_zone` says where the clock hung.
@@ -12,45 +10,29 @@ has a zone until the experiment's `time_zone` says where the clock hung.
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, NoReturn
 from zoneinfo import ZoneInfo
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.validation import FloatArray, as_array, as_name, is_of_library, shorten
+from switchfit.problem.time_units import SECONDS_OF_UNIT, TIME_UNITS
+from switchfit.problem.validation.arrays import as_array
+from switchfit.problem.validation.messages import shorten
+from switchfit.problem.validation.names import as_name
+from switchfit.problem.validation.tables import is_of_library
 
 Instants = NDArray[np.datetime64]
 """In microseconds: in UTC, or on the wall clock of dates without a zone."""
 
-EXAMPLES = "2024-05-01, 2024-05-01T12:34:56 or 2024-05-01T12:34:56+02:00"
-FIRST, LAST = np.datetime64("0001-01-01"), np.datetime64("9999-12-31")
+DATE_EXAMPLES = "2024-05-01, 2024-05-01T12:34:56 or 2024-05-01T12:34:56+02:00"
+
+FIRST_DAY, LAST_DAY = np.datetime64("0001-01-01"), np.datetime64("9999-12-31")
 """The days that a `datetime` may have."""
-
-SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-"""Length of a unit of time in seconds."""
-
-LENGTHS: dict[str, np.timedelta64] = {
-    unit: np.timedelta64(1, "ns") if unit == "ns" else np.timedelta64(round(1e6 * seconds), "us")
-    for unit, seconds in SECONDS.items()
-}
-"""The same, by which a difference of dates is divided."""
-
-_SPELLINGS = {
-    "ns": ("ns", "nsec", "nsecs", "nanosecond", "nanoseconds"),
-    "us": ("us", "µs", "μs", "usec", "usecs", "micros", "microsecond", "microseconds"),
-    "ms": ("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"),
-    "s": ("s", "sec", "secs", "second", "seconds"),
-    "min": ("min", "mins", "minute", "minutes"),
-    "h": ("h", "hr", "hrs", "hour", "hours"),
-    "d": ("d", "day", "days"),
-}
-TIME_UNITS = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings}
-"""The key of `SECONDS` that a word stands for."""
 
 _DATE_TYPES = (str, datetime.date, np.datetime64)  # a datetime and a Timestamp of pandas are dates too
 
@@ -108,13 +90,13 @@ def _name_tzinfo(tz: Any) -> str:
     return str(name)
 
 
-def _read_date(value: Any, what: str, place: str = "") -> tuple[Any, str]:
+def read_instant(value: Any, what: str, place: str = "") -> tuple[Any, str]:
     """Return the instant and the zone of one date; `place` says where it stands among several."""
     if isinstance(value, str):
         found = read_date_text(value)
         if found is None:
             wanted = "numbers or dates" if place else "a number or a date"
-            raise ValueError(f"{what} must be {wanted}; got {shorten(value)}{place}. Write dates as {EXAMPLES}.")
+            raise ValueError(f"{what} must be {wanted}; got {shorten(value)}{place}. Write dates as {DATE_EXAMPLES}.")
         return found
     if value is None or str(value) in ("NaT", "<NA>", "nan"):
         _refuse_missing(what, place)
@@ -133,7 +115,7 @@ def _as_instants(array: NDArray[Any], what: str) -> Instants:
     if missing.any():
         _refuse_missing(what, f" at index {np.argmax(missing)}")
     days = array.astype("datetime64[D]")
-    if not ((days >= FIRST) & (days <= LAST)).all():
+    if not ((days >= FIRST_DAY) & (days <= LAST_DAY)).all():
         raise ValueError(f"{what} must lie in the years 1 to 9999; got {shorten(array.astype(str))}.")
     return array.astype("datetime64[us]")
 
@@ -239,7 +221,7 @@ def read_dates(value: Any, what: str) -> Dates | None:
     if isinstance(value, Dates):
         return value
     if isinstance(value, _DATE_TYPES):
-        instant, zone = _read_date(value, what)
+        instant, zone = read_instant(value, what)
         return Dates(np.array(instant), zone)
     dtype = getattr(value, "dtype", None)
     tz = getattr(dtype, "tz", None) or getattr(dtype, "time_zone", None)  # of pandas, of polars
@@ -257,7 +239,7 @@ def read_dates(value: Any, what: str) -> Dates | None:
 
 def _read_entries(entries: list[Any], what: str) -> Dates:
     """Return entries, each a date or text, as dates."""
-    pairs = [_read_date(entry, what, f" at index {index}") for index, entry in enumerate(entries)]
+    pairs = [read_instant(entry, what, f" at index {index}") for index, entry in enumerate(entries)]
     zones = {zone for _, zone in pairs}
     if "" in zones and len(zones) > 1:
         raise ValueError(f"{what} must all have a time zone, or none; got {shorten(entries)}.")
@@ -338,157 +320,9 @@ def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:
     """
     key = TIME_UNITS.get(as_name(unit, "unit"), "")
     if not key:
-        raise ValueError(f"unit must be one of {', '.join(SECONDS)}; got {shorten(unit)}.")
-    micros = as_array(numbers, "numbers since 1970") * (1e6 * SECONDS[key])
-    first, last = (day.astype("datetime64[us]").astype(np.int64) for day in (FIRST, LAST))
+        raise ValueError(f"unit must be one of {', '.join(SECONDS_OF_UNIT)}; got {shorten(unit)}.")
+    micros = as_array(numbers, "numbers since 1970") * (1e6 * SECONDS_OF_UNIT[key])
+    first, last = (day.astype("datetime64[us]").astype(np.int64) for day in (FIRST_DAY, LAST_DAY))
     if not ((micros >= first) & (micros <= last)).all():
         raise ValueError(f"numbers since 1970 in {key} must lie in the years 1 to 9999; got {shorten(numbers)}.")
     return Dates(np.rint(micros).astype(np.int64).astype("datetime64[us]"), "UTC")
-
-
-# --- the origin of an experiment --------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Origin:
-    """The date at which the times of an experiment are 0, and the zone in which its dates are shown.
-
-    Attributes
-    ----------
-    date : str
-        ISO 8601, with its offset from UTC unless it has no zone.
-    time_zone : str
-        Such as "Europe/Berlin", "UTC" or "+02:00"; "" for dates without a zone.
-    """
-
-    date: str
-    time_zone: str
-
-    @cached_property
-    def instant(self) -> Any:
-        """The date in microseconds: in UTC, or on the wall clock if it has no zone."""
-        return _read_date(self.date, "origin")[0]
-
-    @cached_property
-    def zone(self) -> datetime.tzinfo | None:
-        """The zone as a tzinfo; None for dates without one."""
-        return find_zone(self.time_zone) if self.time_zone else None
-
-    def to_numbers(self, dates: Dates, time_unit: str, what: str = "times") -> FloatArray:
-        """Return dates as numbers of a unit since the origin, of the same shape.
-
-        Parameters
-        ----------
-        dates : Dates
-            Those without a zone are of the origin's.
-        time_unit : str
-        what : str, optional
-            Name of the argument, for messages.
-
-        Raises
-        ------
-        ValueError
-            For dates with a zone if the origin has none, and for times that clocks skip or show twice.
-        """
-        if dates.time_zone and not self.time_zone:
-            raise ValueError(f"{what}: {dates!r} has a time zone, but the dates of the experiment have none.")
-        instants = dates.localize(self.time_zone, what).instants
-        return np.asarray((instants - self.instant) / LENGTHS[normalize_time_unit(time_unit)])
-
-    def to_dates(self, times: ArrayLike, time_unit: str) -> list[datetime.datetime]:
-        """Return times (K,) as dates in the experiment's zone, to the microsecond.
-
-        Parameters
-        ----------
-        times : (K,) array_like
-            In `time_unit` since the origin.
-        time_unit : str
-
-        Raises
-        ------
-        ValueError
-            For times that are not finite, or before the year 1 or after 9999.
-        """
-        found = []
-        for time in np.atleast_1d(np.asarray(times, dtype=np.float64)).tolist():
-            date = self.find_date(time, time_unit)
-            if date is None:
-                raise ValueError(f"{time:g} {time_unit} since {self.date} is no date of the years 1 to 9999.")
-            found.append(date)
-        return found
-
-    def find_date(self, time: float, time_unit: str) -> datetime.datetime | None:
-        """Return a time as a date in the experiment's zone; None if it is not finite or beyond the years 1 to 9999."""
-        length = 1e6 * SECONDS[normalize_time_unit(time_unit)]
-        try:
-            moment: datetime.datetime = self.instant.item() + datetime.timedelta(microseconds=round(time * length))
-            return moment if self.zone is None else moment.replace(tzinfo=datetime.UTC).astimezone(self.zone)
-        except (OverflowError, ValueError):
-            return None
-
-
-def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, time_zone: Any, t0: Any) -> Origin:
-    """Return the origin of an experiment: as given, else t0 if that is a date, else the earliest date of the data.
-
-    Parameters
-    ----------
-    given : sequence of Given
-        All dates of the experiment but the origin.
-    data : sequence of Given
-        Those of its data; empty unless all times of the data are dates.
-    origin : date, Origin or None
-    time_zone : str or None
-        Of dates without a zone, and in which all are shown.
-    t0 : Dates, or anything else
-
-    Raises
-    ------
-    ValueError
-        For dates with a zone beside dates without and no `time_zone`, an unknown zone, and numbers whose origin is not
-        stated.
-    TypeError
-        For an origin that is no date, and a `time_zone` that is no string.
-    """
-    start = None if origin is None else as_date(origin.date if isinstance(origin, Origin) else origin, "origin")
-    form = "the name of a time zone, such as 'Europe/Berlin', or an offset such as '+02:00'"
-    asked = None if time_zone is None else as_name(time_zone, "time_zone", form)
-    if asked is not None:
-        find_zone(asked)
-    every = [*given, *([] if start is None else [("origin", start)])]
-    if not every:
-        raise ValueError(f"time_zone is {asked!r}, but no time is a date: give origin, the date of time 0.")
-    bare, zoned = ([one for one in every if bool(one[1].time_zone) is has] for has in (False, True))
-    if asked is None and bare and zoned:
-        (what, dates), (other, others) = zoned[0], bare[0]
-        raise ValueError(
-            f"{what} has a time zone ({dates!r}), but {other} has none ({others!r}): give time_zone='Europe/Berlin', "
-            "or whatever it is, for those."
-        )
-    zones = {dates.time_zone for _, dates in zoned}
-    zone = asked if asked is not None else "" if bare else zones.pop() if len(zones) == 1 else "UTC"
-    start = t0 if start is None and isinstance(t0, Dates) else start
-    candidates = data if start is None else [("origin", start)]
-    if not candidates:
-        raise ValueError(
-            f"{given[0][0]} is a date, but not all times of the data are: give origin, the date of time 0."
-        )
-    located = [dates.localize(zone, what) for what, dates in candidates]
-    return make_origin(min(each.instants.min() for each in located), zone)
-
-
-def make_origin(instant: Any, zone: str) -> Origin:
-    """Return the origin at a date of `Dates.instants`."""
-    return Origin(format_instant(instant, zone), zone)
-
-
-def normalize_time_unit(unit: str) -> str:
-    """Return the key of `SECONDS` that a unit of times that are dates stands for.
-
-    Raises
-    ------
-    ValueError
-        For any other unit.
-    """
-    if unit.lower() in TIME_UNITS:
-        return TIME_UNITS[unit.lower()]
-    raise ValueError(f"time_unit must be one of {', '.join(SECONDS)} where times are dates; got {shorten(unit)}.")

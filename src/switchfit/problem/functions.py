@@ -1,30 +1,17 @@
 """Traced functions of the user: each is a jaxpr, traced when its problem is built, and compared by content.
 
 Functions with equal jaxprs are equal, whatever Python objects they came from, so that they share compiled programs. A
-function that reads a value that has changed has another jaxpr and is another `Function`. `switchfit.problem.functions`
+function that reads a value that has changed has another jaxpr and is another `Function`. `switchfit.problem.contents`
 decides whether a trace can be reused without calling the user's function.
-
-Contents of a Python function: its code, closure, defaults and globals, for comparison by value.
-
-Two functions with equal `read_contents` have equal traces, so that a trace can be reused without calling the function:
-a problem of the benchmark's vehicle is then built in 0.2 ms, and in 15 to 50 ms if it is traced anew.
-Only plain values are compared by content: numbers, strings, arrays, tuples, lists, dicts, functions made of them.
-Functions of the libraries in `TRUSTED`, and those that are defined in switchfit's own modules, do not change and are
-compared by identity: what they read themselves is not looked at. For anything else (objects with state, modules of the
-user, files, the time) `read_contents` returns None, and the caller has to trace.
 """
 
 from __future__ import annotations
 
-import builtins
 import copy
-import dis
-import functools
 import hashlib
 import itertools
 import threading
-import types
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from itertools import compress
@@ -35,142 +22,34 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import partial_eval
 
-from switchfit.problem.jaxprs import find_read_entries, list_jaxprs, refuse_wrong_constants
-from switchfit.problem.validation import find_misfit, join_names
-
-TRUSTED = frozenset(
-    {"jax", "jaxlib", "numpy", "scipy", "math", "cmath", "functools", "operator", "itertools", "typing"}
-)
-"""Libraries whose functions, classes and constants do not change."""
-
-OWN = __name__.partition(".")[0]
-"""The package of the built-in models. Its functions are trusted too, but not those that a function returns: there is a
-new one for each model, and they are compared by content."""
-
-OPAQUE_BUILTINS = frozenset(
-    {"__import__", "compile", "delattr", "eval", "exec", "getattr", "globals", "id", "input", "locals", "next", "open"}
-    | {"setattr", "vars"}
-)
-"""Builtins by which a function reads values that its code does not name."""
-
-NUMBERS = (types.NoneType, bool, int, float, complex, str, bytes, types.EllipsisType)
-
-JITTED = type(jax.jit(lambda: None))
-"""Type of the result of `jax.jit`."""
-
-FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType, JITTED, type(jnp.add), jax.custom_jvp, jax.custom_vjp)
-"""Types of a library's functions; instances of its classes may have state."""
-
-
-class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
-    """A function reads something that cannot be compared by content."""
-
-
-def read_contents(function: Any) -> Hashable | None:
-    """Return everything that a function reads, by content; None if it is unknown and the function has to be traced."""
-    try:
-        return _read(function)
-    except (NotPlain, RecursionError):  # of what contains itself
-        return None
-
-
-def _read(value: Any) -> Hashable:
-    kind = type(value)
-    if kind in NUMBERS:
-        return kind, repr(value) if kind in (float, complex) else value  # -0.0 is not 0.0, nan is nan
-    if kind is np.ndarray or isinstance(value, (np.generic, jax.Array)):
-        return _read_array(value)
-    if kind in (tuple, list):
-        return kind, tuple(map(_read, value))
-    if kind in (dict, types.MappingProxyType):
-        return dict, _read(list(value.items()))
-    if kind is functools.partial:
-        return kind, _read((value.func, value.args, value.keywords))
-    if _is_trusted(value):
-        return kind, id(value), value  # which is kept alive
-    if kind is types.FunctionType and not vars(value):
-        return _read_function(value)
-    raise NotPlain  # also a jitted function: JAX caches a trace of its own, which the caller has to invalidate
-
-
-def _read_array(value: Any) -> Hashable:
-    if isinstance(value, jax.core.Tracer) or value.dtype.hasobject:
-        raise NotPlain
-    array = np.asarray(value)
-    digest = hashlib.blake2b(array.tobytes(), digest_size=16).digest()
-    weak = bool(getattr(value, "weak_type", False))
-    return "array", isinstance(value, jax.Array), weak, str(array.dtype), array.shape, digest
-
-
-def _read_function(function: types.FunctionType) -> Hashable:
-    names, scope = _list_globals(function.__code__), function.__globals__
-    if names is None:
-        raise NotPlain
-    try:
-        cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    except ValueError as error:  # a cell that is still empty
-        raise NotPlain from error
-    found = {}
-    for name in names:
-        if name in scope:
-            found[name] = scope[name]
-        elif name in OPAQUE_BUILTINS or not hasattr(builtins, name):
-            raise NotPlain
-    return function.__code__, _read((function.__defaults__, function.__kwdefaults__, cells, found))
-
-
-def _is_trusted(value: Any) -> bool:
-    """Return whether a value is a module, function or class of a library that does not change."""
-    if isinstance(value, (types.ModuleType, np.dtype, np.ufunc)):
-        return isinstance(value, (np.dtype, np.ufunc)) or _is_library(value.__name__)
-    if not isinstance(value, (type, *FUNCTIONS)):
-        return False
-    modules = {getattr(value, "__module__", None) or ""} - {"builtins"}
-    if isinstance(value, types.BuiltinFunctionType) and not isinstance(value.__self__, types.ModuleType | None):
-        return False  # a method of an object
-    if isinstance(value, types.FunctionType):
-        # A decorated function may have the name of the module of another one: where the code stands counts too.
-        modules.add(value.__globals__.get("__name__") or "")
-        if all(module.partition(".")[0] == OWN for module in modules):
-            return "<locals>" not in value.__code__.co_qualname
-    return all(map(_is_library, modules))
-
-
-def _is_library(module: str) -> bool:
-    return module.partition(".")[0] in TRUSTED
-
-
-@functools.lru_cache(maxsize=1024)
-def _list_globals(code: types.CodeType) -> tuple[str, ...] | None:
-    """Return the globals that a code object, and those inside it, read; None if it reads anything in another way."""
-    names, pending = set[str](), [code]
-    while pending:
-        each = pending.pop()
-        pending += [constant for constant in each.co_consts if isinstance(constant, types.CodeType)]
-        for instruction in dis.get_instructions(each):
-            name, argument = instruction.opname, instruction.argval
-            if name in ("LOAD_GLOBAL", "LOAD_NAME"):
-                names.add(argument)
-            elif (
-                ("GLOBAL" in name or name == "LOAD_BUILD_CLASS")
-                or (name in ("STORE_DEREF", "DELETE_DEREF") and argument in code.co_freevars)
-                or (name == "IMPORT_NAME" and not _is_library(argument))
-            ):
-                return None
-    return tuple(sorted(names))
-
+from switchfit.problem.contents import JITTED, read_contents
+from switchfit.problem.jaxpr_text import describe_jaxpr
+from switchfit.problem.jaxprs import find_read_entries, list_jaxprs
+from switchfit.problem.traced_constants import refuse_wrong_constants
+from switchfit.problem.validation.messages import join_names
+from switchfit.problem.validation.objects import find_misfit
 
 Array = jax.Array
 Shape = tuple[int, ...]
+
+UNTRACEABLE = (jax.errors.ConcretizationTypeError, jax.errors.TracerIntegerConversionError)
+"""Exceptions of JAX when Python code needs the value of a traced number."""
+
+_traces: dict[Any, Function] = {}
+_lock = threading.Lock()
+
+MOST_TRACES = 1024
+"""Number of functions whose traces are cached; the oldest go first."""
+
+_turn = itertools.count(1)
+
+_retracing = jax.make_user_context(0)
+"""With a new value, JAX does not reuse earlier traces of jitted functions inside a function."""
 
 
 def use_float64() -> Any:
     """Return a context in which JAX computes in float64; the user's setting is restored at its end."""
     return jax.enable_x64(True)
-
-
-UNTRACEABLE = (jax.errors.ConcretizationTypeError, jax.errors.TracerIntegerConversionError)
-"""Exceptions of JAX when Python code needs the value of a traced number."""
 
 
 class Function:
@@ -198,7 +77,7 @@ class Function:
         self.shape: Shape = tuple(closed.out_avals[0].shape)
         self.jaxpr, self.consts = closed.jaxpr, closed.consts
         self.structs = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in closed.in_avals]
-        content = _describe_content(closed)
+        content = describe_jaxpr(closed)
         self.digest = hashlib.sha256("\n".join([repr(parameters), *content.lines]).encode()).hexdigest()
         self._opaque = tuple(content.opaque)  # compared by identity, therefore kept alive
         self._key = (self.digest, tuple(map(id, self._opaque)))
@@ -247,17 +126,6 @@ def _as_float64(value: Any) -> Any:
     """Return a value as a float64 array without weak type, which Python's numbers have, as the jaxpr requires."""
     is_double = getattr(value, "dtype", None) == np.float64 and not getattr(value, "weak_type", False)
     return value if is_double else jnp.asarray(value, jnp.float64)
-
-
-_traces: dict[Any, Function] = {}
-_lock = threading.Lock()
-
-MOST_TRACES = 1024
-"""Number of functions whose traces are cached; the oldest go first."""
-
-_turn = itertools.count(1)
-_retracing = jax.make_user_context(0)
-"""With a new value, JAX does not reuse earlier traces of jitted functions inside a function."""
 
 
 class Call(NamedTuple):
@@ -345,86 +213,6 @@ def _copy_literals(jaxpr: Any) -> None:
         for atom in (*each.outvars, *(atom for equation in each.eqns for atom in equation.invars)):
             if isinstance(getattr(atom, "val", None), np.ndarray):
                 atom.val = copy.deepcopy(atom.val)
-
-
-# The content of a jaxpr
-
-RULES = ("jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "out_trees", "name", "debug_info")
-"""Parameters of operations that are not compared: names, and derivative rules, which show in the derivatives."""
-
-
-def _describe_content(closed: Any) -> _Text:
-    """Return a jaxpr as text, with the values of its constants, and the objects in it that have no text."""
-    text = _Text(closed)
-    if text.has_rules:
-        try:
-            text.lines += _Text(_differentiate_twice(closed)).lines
-        except TypeError:  # functions with reverse-mode rules only have no forward derivative
-            text.opaque.append(object())
-    return text
-
-
-def _differentiate_twice(closed: Any) -> Any:
-    """Return the jaxpr of the first and second derivatives along all arguments, in which custom rules are applied."""
-
-    def value(*arguments: Any) -> Any:
-        return jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *arguments)[0]
-
-    def slope(*arguments: Any) -> Any:
-        return jax.jvp(value, arguments, arguments)[1]
-
-    return jax.make_jaxpr(lambda *a: (slope(*a), jax.jvp(slope, a, a)[1]))(*closed.in_avals)
-
-
-class _Text:
-    """Lines that describe a jaxpr, variables numbered in their order."""
-
-    def __init__(self, closed: Any) -> None:
-        self.lines: list[str] = []
-        self.opaque: list[Any] = []
-        self.has_rules = False
-        self.add(closed.jaxpr, closed.consts)
-
-    def add(self, jaxpr: Any, consts: Sequence[Any]) -> None:
-        """Describe a jaxpr."""
-        number: dict[Any, int] = {}
-
-        def atom(a: Any) -> str:
-            return self._array(a.val) if hasattr(a, "val") else f"%{number.setdefault(a, len(number))}"
-
-        for variables in (jaxpr.constvars, jaxpr.invars):
-            self.lines.append(" ".join(f"{atom(v)}:{v.aval.str_short()}" for v in variables))
-        self.lines += [self._array(const) for const in consts]
-        for equation in jaxpr.eqns:
-            given = " ".join(map(atom, equation.invars))
-            made = " ".join(f"{atom(v)}:{v.aval.str_short()}" for v in equation.outvars)
-            self.lines.append(f"{made} = {equation.primitive.name} {given}")
-            self.has_rules = self.has_rules or equation.primitive.name.startswith("custom_")
-            for name, value in sorted(equation.params.items()):
-                if name not in RULES:
-                    self._parameter(name, value)
-        self.lines.append("-> " + " ".join(map(atom, jaxpr.outvars)))
-
-    def _parameter(self, name: str, value: Any) -> None:
-        if hasattr(value, "eqns"):
-            self.lines.append(f"{name}:")
-            self.add(getattr(value, "jaxpr", value), getattr(value, "consts", ()))
-        elif isinstance(value, (tuple, list)) and any(hasattr(v, "eqns") for v in value):
-            for entry in value:
-                self._parameter(name, entry)
-        elif isinstance(value, (np.ndarray, jax.Array)):
-            self.lines.append(f"{name}={self._array(value)}")
-        else:
-            text = repr(value)
-            if " at 0x" in text or (callable(value) and not isinstance(value, type)):
-                text = f"object {len(self.opaque)}"
-                self.opaque.append(value)
-            self.lines.append(f"{name}={text}")
-
-    def _array(self, value: Any) -> str:
-        array = np.asarray(value)
-        digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).hexdigest()
-        return f"{array.dtype}{list(array.shape)}{digest}"
 
 
 # Calling a user's function while tracing

@@ -1,7 +1,4 @@
-"""What is estimated: a system, the experiments made with it, and their parameters, checked against one another.
-
-Whether the parts of a problem fit one another: modes, parameters, maps, noise, delays and initial states.
-"""
+"""Problem: a system, the experiments made with it, and the parameters to estimate."""
 
 from __future__ import annotations
 
@@ -15,90 +12,35 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.optimize import LinearConstraints
-from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
+from switchfit.problem.consistency import check_durations, check_names, check_parameters
+from switchfit.problem.constraints import Constraint, ConstraintKind
+from switchfit.problem.costs import TerminalConstraint
 from switchfit.problem.experiment import Experiment, drop_jumps, insert_jumps, name_runs, prefix_runs
-from switchfit.problem.parameter import Parameter, as_parameter, require_time_unit, unit_suffix
-from switchfit.problem.structure import Sources, Structure, choose_common_lengths, trace_structure
+from switchfit.problem.measurements import Measurements
+from switchfit.problem.padding import choose_common_lengths
+from switchfit.problem.structure import Structure
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.unknowns import Constraint, ConstraintKind, Unknowns, list_unknowns
-from switchfit.problem.validation import (
-    as_array,
-    as_choice,
-    as_count,
-    as_instance,
-    as_instances,
-    as_name,
-    as_not_negative,
-    as_positive,
-    join_names,
-    require_known,
-    set_fields,
-    shorten,
-)
+from switchfit.problem.tracing import Sources, trace_structure
+from switchfit.problem.unknowns import Unknowns, list_unknowns
+from switchfit.problem.validation.arrays import FloatArray, as_array, as_count, as_positive
+from switchfit.problem.validation.messages import join_names, shorten, unit_suffix
+from switchfit.problem.validation.names import as_choice, require_known
+from switchfit.problem.validation.objects import as_instance, as_instances, set_fields
 from switchfit.runtime.presentation import format_count, format_html, format_line, join_first
-
-
-def check_parameters(parameters: Any) -> dict[str, Parameter]:
-    """Return the parameters of a problem by their names."""
-    if not isinstance(parameters, Mapping | None):
-        raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shorten(parameters)}.")
-    return {
-        as_name(name, "parameter names", "strings"): as_parameter(value, f"parameter {shorten(name)}")
-        for name, value in (parameters or {}).items()
-    }
-
-
-def check_durations(given: Any, system: HybridSystem) -> float | dict[str, float]:
-    """Return the shortest duration of all modes, or of each mode that a mapping names."""
-    if not isinstance(given, Mapping):
-        return as_not_negative(given, "min_duration")
-    require_known(given, "min_duration", system.modes)
-    return {mode: as_not_negative(value, f"min_duration of {shorten(mode)}") for mode, value in given.items()}
-
-
-def check_names(run: Experiment, parameters: Mapping[str, Parameter]) -> None:
-    """Check the parameters that a map, a sigma or a delay names; with a delay, all samples must be inside the horizon
-    wherever it is within its bounds.
-    """
-    for here, target in run.parameter_map.items():
-        if target not in parameters:
-            raise ValueError(
-                f"parameter_map has {shorten(here)} -> {shorten(target)}, but the problem has {join_names(parameters)}."
-            )
-
-    def find_scalar(what: str, name: str) -> Parameter:
-        parameter = parameters.get(run.parameter_map.get(name, name))
-        if parameter is None or parameter.shape != ():
-            raise ValueError(
-                f"{what} names {shorten(name)}, which must be a parameter of one number; the problem has "
-                f"{join_names(parameters)}."
-            )
-        return parameter
-
-    for item in run.measurements:
-        for name in filter(None, item.sigma_names):
-            sigma = find_scalar("sigma", name)
-            if not (sigma.positive or (sigma.fixed and sigma.value > 0)):
-                raise ValueError(
-                    f"sigma names the parameter {name!r}, which must stay positive: give it a lower bound above 0, or "
-                    f"scale='log'; got the lower bound {sigma.lower}."
-                )
-        if isinstance(item.delay, str):
-            delay = find_scalar("delay", item.delay)
-            require_time_unit(delay, f"the delay {item.delay!r}", run.time_unit)
-            low, high = item.times[-1] - run.earliest_end, item.times[0] - run.t0
-            least, most = (delay.value,) * 2 if delay.fixed else (delay.lower, delay.upper)
-            if not low <= least <= most <= high:
-                raise ValueError(
-                    f"the delay {item.delay!r} may lie in [{least}, {most}], but only from {low:.6g} to {high:.6g}"
-                    f"{unit_suffix(run.time_unit)} are all samples inside (t0, tf) = ({run.t0}, {run.earliest_end}): "
-                    "give it narrower bounds, move t0 or tf, or leave out samples at the ends."
-                )
-
 
 T = TypeVar("T")
 
-GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
+PROBLEM_ARGUMENTS = (
+    "system",
+    "experiments",
+    "parameters",
+    "min_duration",
+    "solver",
+    "rtol",
+    "atol",
+    "engine",
+    "max_transitions",
+)
 """What a `Problem` is built from."""
 
 SMALLEST_RTOL = 1e-13
@@ -107,7 +49,7 @@ SMALLEST_RTOL = 1e-13
 PERFECT_RESIDUAL = 1e-8
 """Residual of a perfect fit, as a part of the sample."""
 
-ROUNDING = 1e-12
+DISORDER_BY_ROUNDING = 1e-12
 """Transition times that are out of order by less than this part of the horizon are so by rounding."""
 
 
@@ -290,13 +232,13 @@ class Problem:
             for run, modes, times in given
         )
         changed: Problem = object.__new__(Problem)
-        set_fields(changed, **{name: getattr(self, name) for name in (*GIVEN, "_sources")})
+        set_fields(changed, **{name: getattr(self, name) for name in (*PROBLEM_ARGUMENTS, "_sources")})
         changed._set_experiments(experiments)
         return changed
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: the user's functions, and of their traces what identifies them."""
-        return {name: getattr(self, name) for name in GIVEN} | {"digests": self.digests}
+        return {name: getattr(self, name) for name in PROBLEM_ARGUMENTS} | {"digests": self.digests}
 
     @property
     def digests(self) -> list[dict[str, str]]:
@@ -305,7 +247,7 @@ class Problem:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Build the problem again; ValueError if a function does something else than when the problem was built."""
-        set_fields(self, **{name: state[name] for name in GIVEN})
+        set_fields(self, **{name: state[name] for name in PROBLEM_ARGUMENTS})
         self.__post_init__()
         for structure, digests in zip(self.structures, state["digests"], strict=True):
             changed = [name for name, digest in structure.digests.items() if digests.get(name) != digest]
@@ -568,7 +510,7 @@ class Problem:
             times = self._select_times(checked, e)
             knots = np.concatenate([[experiment.t0], times, [experiment.end]])
             shortest = (knots[1:] - knots[:-1]).min()
-            if shortest < -ROUNDING * experiment.clock:
+            if shortest < -DISORDER_BY_ROUNDING * experiment.clock:
                 last = ", with the upper bound of tf for its end" if experiment.has_free_tf else ""
                 raise ValueError(
                     f"The transition times in {what} must not decrease inside (t0, tf) = ({experiment.t0}, "
@@ -580,7 +522,10 @@ class Problem:
                 ordered = np.maximum.accumulate(np.clip(times, low, high[:-1]))
                 checked[where[where >= 0]] = ordered[where >= 0]
             for jump, n in zip(experiment.jump_times.tolist(), experiment.passed_by_jumps.tolist(), strict=True):
-                if knots[n] > jump + ROUNDING * experiment.clock or knots[n + 1] < jump - ROUNDING * experiment.clock:
+                if (
+                    knots[n] > jump + DISORDER_BY_ROUNDING * experiment.clock
+                    or knots[n + 1] < jump - DISORDER_BY_ROUNDING * experiment.clock
+                ):
                     raise ValueError(
                         f"The transition times in {what} must stay on that side of each known jump on which their "
                         f"guesses are; got {shorten(times)}, on another side of the jump at {jump:g}. Give the "

@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.parameter import Parameter, as_parameter
-from switchfit.problem.validation import as_array, as_callable, as_labels, as_name, require_known, set_fields, shorten
+from switchfit.problem.validation.arrays import as_array
+from switchfit.problem.validation.messages import shorten
+from switchfit.problem.validation.names import as_labels, as_name, require_known
+from switchfit.problem.validation.objects import as_callable, set_fields
 from switchfit.runtime.presentation import format_line, join_first
 
 VectorField = Callable[..., Any]

@@ -1,17 +1,8 @@
-"""The flat vector theta of everything that is estimated, and the linear constraints on it.
+"""Unknowns of a problem: where each stands in the vector theta, with bounds, priors and order of times.
 
 ``theta`` holds the free transition times of the first experiment and its tf where it is free, of the second, ..., then
 the free parameters in the order given, then the unknown entries of the initial states, again experiment by experiment.
 Everything that is fixed stays out of it.
-
-The linear constraints on theta as data: order and durations of the modes, and bounds.
-
-Variables of the optimizer: unknowns scaled to the size of one, or their logarithms.
-
-    theta = s z,  or  theta = o + exp(z):      d theta / dz = D,    g_z = D g,    H_z = D H D + diag(E g),
-
-with E = d^2 theta / dz^2, 0 or theta - o. Unknowns whose size is near one are not scaled: s = 1. The origin o of a
-logarithm is 0; for a transition time it is the t0 of its experiment.
 """
 
 from __future__ import annotations
@@ -19,157 +10,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.data import FloatArray
+from switchfit.problem.constraints import Constraint, ConstraintKind
 from switchfit.problem.experiment import Experiment, initial_state_of, name_runs, prefix_runs
-from switchfit.problem.parameter import Parameter, PriorTerms, unit_suffix
+from switchfit.problem.parameter import Parameter
+from switchfit.problem.priors import PriorTerms
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.validation import join_names
-from switchfit.runtime.presentation import Printed
-
-ConstraintKind = Literal["collapsed", "minimum duration", "lower bound", "upper bound", "known jump"]
-
-
-@dataclass(frozen=True)
-class Constraint(Printed):
-    """A linear constraint; print it for a sentence about it when it is active.
-
-    Attributes
-    ----------
-    kind : {"collapsed", "minimum duration", "lower bound", "upper bound", "known jump"}
-        "collapsed" is a minimum duration of 0: when it is active, the mode has zero duration. "known jump" is the bound
-        of a transition time at the time of a `Jump`, on whose other side its guess does not lie.
-    value : float
-        The minimum duration in the time unit of the run, or the bound in the unit of the unknown.
-    unknown : str
-        Name of the unknown that has the bound; empty for a duration.
-    mode : str
-        Name of the mode that has the duration; empty for a bound.
-    position : int or None
-        Index of that mode in the mode sequence, from 0; None for a bound.
-    run : str
-        Name of the experiment that has the mode; empty for a bound, and if there is only one experiment.
-    """
-
-    kind: ConstraintKind
-    value: float
-    unknown: str = ""
-    mode: str = ""
-    position: int | None = None
-    run: str = ""
-
-
-@dataclass(frozen=True)
-class ActiveConstraint(Constraint):
-    """A linear constraint that holds with equality at a solution; print it for a short sentence.
-
-    Attributes
-    ----------
-    kind, value, unknown, mode, position, run : as in `Constraint`
-    multiplier : float
-        Its Lagrange multiplier, 0 or more: the decrease of J per unit by which the constraint is relaxed; where a
-        transition time is at a sample time, of J on the side that the constraint allows.
-
-    See Also
-    --------
-    Estimate.active : those of a fit.
-    Termination, Issue
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
-    >>> problem = heater_problem()
-    >>> bounded = {**problem.parameters, "k": sf.Parameter(0.3, upper=0.35, unit="1/h")}
-    >>> fit = sf.estimate(sf.Problem(problem.system, problem.experiments[0], bounded))
-    >>> active = fit.active[0]
-    >>> active.kind, active.unknown, active.value, active.multiplier > 0
-    ('upper bound', 'k', 0.35, True)
-    >>> print(active)
-    k at its upper bound 0.35
-    """
-
-    multiplier: float = 0.0
-
-
-ORDINARY = (1e-3, 1e3)
-"""Range of sizes in which an unknown is not scaled; the tolerance on the gradient is then that of theta itself."""
-
-
-SMALLEST = 1e-15
-"""Part of its first guess that an unknown on a logarithmic scale keeps without a lower bound of its own. At 0 the cost
-has no slope in the logarithm, and far below there is nothing left of its curvature but rounding."""
-
-
-class Variables(NamedTuple):
-    """The change of variables: ``size`` (d,), powers of 2, of a logarithm the first guess, ``log`` (d,) of bool, and
-    ``origin`` (d,) of logarithms.
-    """
-
-    size: Any
-    log: Any
-    origin: Any = 0.0
-
-    @classmethod
-    def of(
-        cls, theta: FloatArray, bounds: FloatArray, log: NDArray[np.bool_], keep: NDArray[np.bool_], origin: FloatArray
-    ) -> Variables:
-        """Return variables scaled by the first guess, or by the bounds if it is 0.
-
-        Parameters
-        ----------
-        theta : (d,)
-        bounds : (2, d), lower and upper
-        log : (d,) of bool
-        keep : (d,) of bool, unknowns that are not scaled
-        origin : (d,)
-        """
-        largest = np.where(np.isfinite(bounds), np.abs(bounds), 0.0).max(axis=0)
-        typical = np.where(theta != 0.0, np.abs(theta), largest)
-        outside = (typical > 0) & ((typical < ORDINARY[0]) | (typical > ORDINARY[1])) & ~keep & ~log
-        # A power of 2, so that scaling causes no rounding.
-        size = 2.0 ** np.round(np.log2(np.where(outside, typical, 1.0)))
-        return cls(np.where(log, np.abs(theta - origin), size), log, origin)
-
-    @property
-    def identity(self) -> bool:
-        """Whether the variables equal theta."""
-        return not self.log.any() and bool(np.all(self.size == 1.0))
-
-    @np.errstate(over="ignore")  # a step too far on a logarithmic scale is refused, as J is not finite there
-    def outward(self, z: Any, xp: Any = np) -> Any:
-        """Return theta at z: (d,)."""
-        return xp.where(self.log, self.origin + xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
-
-    def inward(self, theta: Any, xp: Any = np) -> Any:
-        """Return z at theta (d,): of a logarithm, a bound at the origin is `SMALLEST` first guesses away from it."""
-        away = theta - self.origin
-        positive = xp.where(self.log, xp.where(away > 0, away, SMALLEST * self.size), 1.0)
-        return xp.where(self.log, xp.log(positive), theta / self.size)
-
-    def sizes_inward(self, sizes: FloatArray) -> FloatArray:
-        """Return sizes of z for sizes of theta (d,); the size of a logarithm is 1."""
-        return np.where(self.log, 1.0, sizes / self.size)
-
-    def slopes(self, theta: Any, xp: Any = np) -> tuple[Any, Any]:
-        """Return D and E at theta: (d,) each."""
-        away = theta - self.origin
-        return xp.where(self.log, away, self.size), xp.where(self.log, away, 0.0)
-
-    def derivatives_outward(self, theta: Any, gradient: Any, hessian: Any, xp: Any = np) -> tuple[Any, Any]:
-        """Return the gradient and Hessian in theta from those in z."""
-        D, E = self.slopes(theta, xp)
-        gradient = gradient / D
-        return gradient, (hessian - xp.diag(E * gradient)) / xp.outer(D, D)
-
-    def derivatives_inward(self, theta: Any, gradient: Any, hessian: Any, xp: Any = np) -> tuple[Any, Any]:
-        """Return the gradient and Hessian in z from those in theta."""
-        D, E = self.slopes(theta, xp)
-        return D * gradient, hessian * xp.outer(D, D) + xp.diag(E * gradient)
+from switchfit.problem.validation.arrays import FloatArray
+from switchfit.problem.validation.messages import join_names, unit_suffix
+from switchfit.problem.variables import LEAST_PART_OF_GUESS, Variables
 
 
 @dataclass(frozen=True)
@@ -234,7 +87,9 @@ class Unknowns:
     @cached_property
     def lowest(self) -> FloatArray:
         """Lower bounds, those of logarithms above their origins: (d,)."""
-        return np.where(self.log, np.maximum(self.lower, self.origin + SMALLEST * self.variables.size), self.lower)
+        return np.where(
+            self.log, np.maximum(self.lower, self.origin + LEAST_PART_OF_GUESS * self.variables.size), self.lower
+        )
 
     @cached_property
     def log_times(self) -> NDArray[np.bool_]:

@@ -1,8 +1,8 @@
-"""The numbers of results as tables: names, values and units of their columns, for pandas."""
+"""The numbers of results as tables for pandas: names, values and units of their columns."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,11 @@ from switchfit.batch.starts import Multistart
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
-from switchfit.problem.data import FloatArray
-from switchfit.problem.dates import SECONDS, normalize_time_unit
-from switchfit.report.formats import format_iso, format_unit, get_unit, list_dated
+from switchfit.problem.time_units import SECONDS_OF_UNIT, normalize_time_unit
+from switchfit.problem.validation.arrays import FloatArray
+from switchfit.report.numbers import format_unit, get_unit
+from switchfit.report.times import format_iso, list_dated
+from switchfit.report.unknowns import list_holds
 from switchfit.runtime.frames import Column, Frame, describe_frame
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.profiles import Profile
@@ -81,23 +83,6 @@ def _split(values: FloatArray, names: Sequence[str], units: Sequence[str], label
     return [Column(label.format(name), column, format_unit(unit)) for name, unit, column in named]
 
 
-def list_holds(fit: Fit, name: str) -> Iterator[str]:
-    """Yield what holds an unknown: a bound, a kink, or that the cost does not depend on it.
-
-    Parameters
-    ----------
-    fit : Fit
-    name : str
-    """
-    if name in fit.idle:
-        yield "idle"
-    if name in (*fit.unread, *fit.absent):
-        yield "not read"
-    yield from (f"at {c.kind}" for c in fit.active if c.unknown == name and c.position is None)
-    if name in [kink.unknown for kink in fit.kinks]:
-        yield "at a kink"
-
-
 def _describe_trajectories(fit: Fit) -> Frame:
     """Return a row for each node of each run."""
     each = fit.trajectories
@@ -153,7 +138,7 @@ def _list_dates(result: Trajectory | Prediction) -> list[Column]:
     origin = result.origin
     if origin is None:
         return []
-    microseconds = 1e6 * SECONDS[normalize_time_unit(result.time_unit)] * result.times
+    microseconds = 1e6 * SECONDS_OF_UNIT[normalize_time_unit(result.time_unit)] * result.times
     values = origin.instant + np.round(microseconds).astype("timedelta64[us]")
     return [Column("date (UTC)" if origin.time_zone else "date", values.astype("datetime64[ns]"))]
 

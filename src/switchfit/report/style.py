@@ -9,30 +9,39 @@ matplotlib is imported where a figure is made: it takes longer to load than half
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from switchfit.report.formats import Timed, label_quantity, label_time
+from switchfit.report.numbers import label_quantity
+from switchfit.report.times import Timed, label_time
 from switchfit.runtime.presentation import Axes, Figure
 
 if TYPE_CHECKING:
-    from switchfit.report.axes import NotebookFigure
+    from switchfit.report.notebook_figure import NotebookFigure
 
 Drawn = TypeVar("Drawn", bound="Axes | Figure")
 
 MODE_COLOURS = ("#eef4fb", "#f9dfbf", "#e2f2df", "#e9d0e2", "#faf7d4", "#c9dfe1", "#ececec", "#dcc9b6")
 """Light, and of different lightness one after the other, so that they differ in grey too."""
+
 LINE_COLOURS = ("#3b82c4", "#e08a1e", "#3f9b4b", "#9b5fb5", "#b8a400", "#1f9aa0", "#8a8a8a", "#a0643c")
 """Of the same modes in the same hues, for lines and for thin shades: to be told apart on white and on black."""
-FIT, DATA, REFERENCE, TRANSITION, SHADE = "#b2182b", "#222222", "#777777", "#333333", "#4a7fb5"
+
+FIT_COLOUR, DATA_COLOUR, REFERENCE_COLOUR, TRANSITION_COLOUR, SHADE_COLOUR = (
+    "#b2182b",
+    "#222222",
+    "#777777",
+    "#333333",
+    "#4a7fb5",
+)
 """What is fitted, what was measured, what it is compared with, lines in time, and regions of confidence."""
+
 GROUP_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")
 """Of things that are told apart, such as minima; the last is for all others."""
 
 LINE, THIN = 1.5, 0.9
 """Widths of curves, and of lines that help to read them, in points."""
+
 SMALL = "small"
 """Size of names, notes and legends in axes: relative, so that ``font.size`` of matplotlib scales all text."""
 
@@ -44,7 +53,7 @@ def make_figure(width: float, height: float) -> NotebookFigure:
     ----------
     width, height : float
     """
-    from switchfit.report.axes import NotebookFigure
+    from switchfit.report.notebook_figure import NotebookFigure
 
     return NotebookFigure(figsize=(width, height), layout="constrained")
 
@@ -95,7 +104,7 @@ def draw_legend_above(ax: Axes, *, title: str = "") -> None:
     ax : matplotlib.axes.Axes
     title : str, optional
     """
-    from switchfit.report.axes import fit_legend
+    from switchfit.report.notebook_figure import fit_legend
 
     if handles := collect_handles([ax]):
         look = fit_legend(list(handles), ax.bbox.width / ax.figure.dpi, 4, SMALL)
@@ -104,7 +113,7 @@ def draw_legend_above(ax: Axes, *, title: str = "") -> None:
 
 
 def draw_level(
-    ax: Axes, text: str, y: float, side: Literal["left", "right"], *, colour: str = REFERENCE, line: str = "--"
+    ax: Axes, text: str, y: float, side: Literal["left", "right"], *, colour: str = REFERENCE_COLOUR, line: str = "--"
 ) -> None:
     """Draw a horizontal line with its name above one of its ends.
 
@@ -134,7 +143,7 @@ def label_axis(ax: Axes, run: Timed, name: str = "time") -> None:
     """
     ax.set_xlabel(label_time(run, name))
     if run.origin is not None:
-        from switchfit.report.axes import DateFormatter, DateLocator
+        from switchfit.report.date_axis import DateFormatter, DateLocator
 
         locator = DateLocator(run.origin, run.time_unit)
         ax.xaxis.set_major_locator(locator)
@@ -180,17 +189,3 @@ def turn_off_formulas(drawn: Drawn) -> Drawn:
         if "$" in text.get_text() and "\\mathdefault" not in text.get_text():  # as in ticks of matplotlib's own
             text.set_parse_math(False)
     return drawn
-
-
-def embed_figure(figure: Figure, **settings: Any) -> str:
-    """Return a figure as the source of an image.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-    settings
-        Of ``Figure.savefig``.
-    """
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", **settings)
-    return f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"

@@ -1,4 +1,4 @@
-"""The persistent compilation cache: compiled programs are stored in the user's cache folder and loaded from there.
+"""The persistent compilation cache: compiled programs, stored in the user's cache folder and loaded again.
 
 It is the folder ``switchfit`` in the user's cache folder (``~/.cache/switchfit`` on Linux), or the folder that the
 environment variable ``SWITCHFIT_CACHE`` names; ``SWITCHFIT_CACHE=off`` turns it off. A cache folder that the user has
@@ -14,7 +14,6 @@ import hashlib
 import os
 import stat
 import sys
-import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
@@ -24,7 +23,6 @@ from typing import Any
 
 import jax
 import platformdirs
-from jax import monitoring
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
 
 from switchfit.runtime.files import write_atomically
@@ -34,34 +32,6 @@ SETTINGS: dict[str, Any] = {
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }
-
-COMPILING = "/jax/core/compile/jaxpr_to_mlir_module_duration", "/jax/core/compile/backend_compile_duration"
-"""JAX's names of what it does when it compiles."""
-
-_compiled = [0.0]
-
-
-def measure_work() -> float:
-    """Return a time in seconds, as of a clock that stands still while programs are compiled."""
-    return time.perf_counter() - _compiled[0]
-
-
-@contextmanager
-def stop_clock() -> Iterator[None]:
-    """Let the clock of `measure_work` stand still."""
-    began = time.perf_counter()
-    try:
-        yield
-    finally:
-        _compiled[0] += time.perf_counter() - began
-
-
-def _count_compilation(event: str, duration_secs: float, **kwargs: str | int) -> None:
-    if event in COMPILING:
-        _compiled[0] += duration_secs
-
-
-monitoring.register_event_duration_secs_listener(_count_compilation)
 
 
 @contextmanager

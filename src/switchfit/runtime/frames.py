@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from switchfit.runtime.errors import import_library
+from switchfit.runtime.extras import import_library
 from switchfit.runtime.presentation import call_registered
 
 if TYPE_CHECKING:

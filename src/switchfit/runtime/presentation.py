@@ -14,6 +14,10 @@ from functools import singledispatch
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+NAMED_IN_LINE = 6
+"""Entries of a list that one line names."""
+
+
 if TYPE_CHECKING:
     from functools import _SingleDispatchCallable
 
@@ -105,10 +109,6 @@ class Displayed(Printed):
 
     def _repr_html_(self) -> str:
         return format_html(self)
-
-
-NAMED_IN_LINE = 6
-"""Entries of a list that one line names."""
 
 
 def format_line(result: Any, *parts: str) -> str:

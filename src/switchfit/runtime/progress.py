@@ -22,6 +22,8 @@ REDRAW = 0.2
 Progress = Callable[[int, int], object]
 """``progress(done, total)``; a true return value stops the run."""
 
+_current: ContextVar[Line | None] = ContextVar("line of progress", default=None)
+
 
 def is_terminal(stream: Any) -> bool:
     """Return whether a stream is a terminal; False if it is closed, or None as in a program without a console."""
@@ -101,9 +103,6 @@ def _show_below(line: Line) -> Iterator[Callable[[], object]]:
     output = shown.display(describe(), display_id=True)
     yield lambda: output.update(describe())
     output.update(shown.HTML(""))
-
-
-_current: ContextVar[Line | None] = ContextVar("line of progress", default=None)
 
 
 @contextmanager

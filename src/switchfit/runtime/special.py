@@ -1,4 +1,4 @@
-"""The functions of `scipy.special`, which is imported at the first use of one: ``special.ndtri(0.975)``.
+"""Functions of `scipy.special`, which is imported at the first call: ``special.ndtri(0.975)``.
 
 To import it takes as long as to fit, and much of what people do with a model does not need it.
 """

@@ -43,16 +43,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.discretization.mesh import Mesh, build_arguments
+from switchfit.discretization.arguments import build_arguments
+from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import hypotheses_of
-from switchfit.engine.native.hypotheses import NativeHypotheses, OrderTables
-from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
+from switchfit.engine.hypotheses import Column, Hypotheses, HypothesisLimits, HypothesisTolerances
+from switchfit.engine.native.native_hypotheses import NativeHypotheses, OrderTables
 from switchfit.fit.evaluator import assume_noise
-from switchfit.problem.corners import find_corners
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.corners.branches import find_corners
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.parameter import Parameter, PriorTerms
+from switchfit.problem.measurements import Measurements
+from switchfit.problem.parameter import Parameter
+from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem, place_parameters
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.strategy.library import (
     PER_SEQUENCE,
     Children,
@@ -69,6 +72,40 @@ from switchfit.strategy.starts import check_time
 
 INTERVALS = 60
 """Births in the horizon where `grid` is left out, if samples are as frequent."""
+
+COLUMNS, (PARENT, BEFORE, AFTER, SLOT) = len(Column), map(int, list(Column)[:4])
+FUNCTIONS = slice(int(Column.RESET_MAP), int(Column.GUARD) + 1)
+
+GUARD_SD = 1e-3
+"""Standard deviation of the time of a transition with a guard, as a part of the grid, given the state and p."""
+
+RTOL = 1e-3
+"""Estimated error of a step, relative to the state. The estimate is of order 3, the error of order 5."""
+
+SPREAD, SPREAD_OF_STATES = 0.5, 10.0
+"""Standard deviation of a parameter and of an entry of the initial state without a prior, relative to its size."""
+
+MOST_AT_ONCE = 1.0
+"""How far a parameter moves after one grid interval, at most, in its standard deviation without data."""
+
+SMALLEST_PART = 0.1
+"""Part of a positive parameter below which a beam does not go."""
+
+REPLAYS, REPLAYS_OF_ORDER, LAST_REPLAYS = 4, 24, 3
+"""How often the hypotheses are propagated anew along the log, also where the order is known, and at its end."""
+
+SMALLEST_WIDTH = 1e-6
+"""Part of the grid by which a time that is fixed may move: H_0 stays finite."""
+
+LIKELY = 5.0
+"""Standard deviations of the prior of a time within which a beam looks for it."""
+
+STIFFNESS = 1e12
+"""Weight of what keeps names of one parameter equal, in units of what a parameter without a prior has: far above what
+data say, and its rounding is far below 1."""
+
+SAMPLES_OF_NOISE = 4.0
+"""Weight, in samples, of the noise that is assumed where sigma is unknown, beside that of the residuals."""
 
 
 def choose_grid(run: Experiment) -> float:
@@ -167,41 +204,6 @@ class Proposal(NamedTuple):
     parameters: FloatArray
     cost: float = np.nan
     evidence: Quadratic | None = None
-
-
-COLUMNS, (PARENT, BEFORE, AFTER, SLOT) = len(Column), map(int, list(Column)[:4])
-FUNCTIONS = slice(int(Column.RESET_MAP), int(Column.GUARD) + 1)
-
-GUARD_SD = 1e-3
-"""Standard deviation of the time of a transition with a guard, as a part of the grid, given the state and p."""
-
-RTOL = 1e-3
-"""Estimated error of a step, relative to the state. The estimate is of order 3, the error of order 5."""
-
-SPREAD, SPREAD_OF_STATES = 0.5, 10.0
-"""Standard deviation of a parameter and of an entry of the initial state without a prior, relative to its size."""
-
-MOST_AT_ONCE = 1.0
-"""How far a parameter moves after one grid interval, at most, in its standard deviation without data."""
-
-SMALLEST_PART = 0.1
-"""Part of a positive parameter below which a beam does not go."""
-
-REPLAYS, REPLAYS_OF_ORDER, LAST_REPLAYS = 4, 24, 3
-"""How often the hypotheses are propagated anew along the log, also where the order is known, and at its end."""
-
-SMALLEST_WIDTH = 1e-6
-"""Part of the grid by which a time that is fixed may move: H_0 stays finite."""
-
-LIKELY = 5.0
-"""Standard deviations of the prior of a time within which a beam looks for it."""
-
-STIFFNESS = 1e12
-"""Weight of what keeps names of one parameter equal, in units of what a parameter without a prior has: far above what
-data say, and its rounding is far below 1."""
-
-SAMPLES_OF_NOISE = 4.0
-"""Weight, in samples, of the noise that is assumed where sigma is unknown, beside that of the residuals."""
 
 
 def follow_order(
@@ -337,7 +339,7 @@ class Beam:
         self.counts = count_values(run.measurements, mesh.times) if is_unknown else None
         self.noise = assume_noise(problem)  # that of all runs
         guards = (self.noise / (GUARD_SD * self.grid)) ** 2
-        self.tolerances = Tolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, guards)
+        self.tolerances = HypothesisTolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, guards)
         self.lock = threading.Lock()
 
     @property
@@ -559,13 +561,13 @@ class Pass:
         steps[..., FUNCTIONS] = np.moveaxis(functions, 0, -1)
         return steps
 
-    def build_limits(self) -> Limits:
+    def build_limits(self) -> HypothesisLimits:
         """Return the limits of how far birth times and parameters may move from where they began."""
         beam, at = self.beam, self.parameters
         near = np.where((beam.lower >= 0) & (at > 0), SMALLEST_PART * at, beam.lower)  # 0 may be no value
         low, high, most = np.maximum(beam.lower, near) - at, beam.upper - at, MOST_AT_ONCE * self.spread
         pairs = (-self.reaches, low), (self.reaches, high), (self.reaches, most)
-        return Limits(*(np.append(of_time, of_p[beam.places]) for of_time, of_p in pairs))
+        return HypothesisLimits(*(np.append(of_time, of_p[beam.places]) for of_time, of_p in pairs))
 
     def build_table(self, kept: Sequences, children: Children, chosen: Integers) -> Integers:
         """Return the table of children for the engine; `chosen` are the records of the hypotheses that were kept."""

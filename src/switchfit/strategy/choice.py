@@ -23,13 +23,16 @@ from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import evaluator_of, measure_variation
 from switchfit.fit.result import Rival, Step, count_priors, count_samples
 from switchfit.optimize import IterationRecord, Status
-from switchfit.optimize.problem import HessianKind
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.optimize.minimization_problem import HessianKind
+from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem, require_estimable
-from switchfit.problem.validation import as_callable, as_choice, as_instance, as_positive
-from switchfit.runtime.cache import measure_work
+from switchfit.problem.reference_signals import ReferenceSignal
+from switchfit.problem.validation.arrays import FloatArray, as_positive
+from switchfit.problem.validation.names import as_choice
+from switchfit.problem.validation.objects import as_callable, as_instance
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
 from switchfit.runtime.progress import Line, show_line
+from switchfit.runtime.work_clock import measure_work
 from switchfit.strategy.hops import (
     WORTH,
     can_reinsert,
@@ -59,6 +62,43 @@ from switchfit.uncertainty.walks import compute_threshold
 
 MORE_STARTS = "next: more starts"
 """Step that a verdict advises where the fit may be better elsewhere."""
+
+logger = logging.getLogger("switchfit")
+Strategy = Literal["local", "auto", "thorough"]
+STRATEGIES = get_args(Strategy)
+OTHER = "another minimum near by"
+
+BEAM, REINSERT, FEW, STARTS = "beam along the log", "removal and re-insertion", "a few starts", "many starts"
+"""Names of strategies. The re-insertion is for costs without data: of the fishing of the benchmark a fit takes 40 ms
+with it, 100 ms with a few starts behind it, and 1 s with many."""
+
+FEW_STARTS = 12
+"""Starts that look whether re-insertion has missed a minimum: one that is met from a fifth of them is missed by 7 %."""
+
+MOST_LEFT = 4
+"""Times that a search goes on to another minimum near by."""
+
+RIVAL_LEVEL, RIVAL_ITERATIONS = 0.95, 20
+"""Confidence level at which the data do not tell two minima apart; and the most iterations of a fit of the other."""
+
+MORE = "more iterations"
+"""Name of what is no search: a fit that has not converged goes on."""
+
+DEEP = 10.0
+"""Multiple of what chi-square hides by which J rises at least around a time that is in no doubt. Wrong ends of weak
+events reach 9.7; the times of a thermostat that switches five times in 40 samples begin at 59."""
+
+LEAST_TIME, TIMES_LOCAL = 2.0, 20.0
+"""Seconds that searches take at most where no budget is given, or so many times what the first fit took."""
+
+ITERATIONS = 200
+"""Most iterations of a fit on one mesh, unless said otherwise."""
+
+MORE_ITERATIONS = 2000
+"""Iterations of a fit that goes on where the first has not converged within those that it was allowed."""
+
+LOWER = 1e-7
+"""Part of the cost by which an end has to be lower to replace the best so far."""
 
 
 def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bool:
@@ -186,45 +226,6 @@ def is_doubted(fit: Estimate) -> bool:
     fit : Estimate
     """
     return not fit.status.successful or any(step.kind == MORE_STARTS for step in fit.verdict.next_steps)
-
-
-logger = logging.getLogger("switchfit")
-
-Strategy = Literal["local", "auto", "thorough"]
-STRATEGIES = get_args(Strategy)
-
-OTHER = "another minimum near by"
-BEAM, REINSERT, FEW, STARTS = "beam along the log", "removal and re-insertion", "a few starts", "many starts"
-"""Names of strategies. The re-insertion is for costs without data: of the fishing of the benchmark a fit takes 40 ms
-with it, 100 ms with a few starts behind it, and 1 s with many."""
-
-FEW_STARTS = 12
-"""Starts that look whether re-insertion has missed a minimum: one that is met from a fifth of them is missed by 7 %."""
-
-MOST_LEFT = 4
-"""Times that a search goes on to another minimum near by."""
-
-RIVAL_LEVEL, RIVAL_ITERATIONS = 0.95, 20
-"""Confidence level at which the data do not tell two minima apart; and the most iterations of a fit of the other."""
-
-MORE = "more iterations"
-"""Name of what is no search: a fit that has not converged goes on."""
-
-DEEP = 10.0
-"""Multiple of what chi-square hides by which J rises at least around a time that is in no doubt. Wrong ends of weak
-events reach 9.7; the times of a thermostat that switches five times in 40 samples begin at 59."""
-
-LEAST_TIME, TIMES_LOCAL = 2.0, 20.0
-"""Seconds that searches take at most where no budget is given, or so many times what the first fit took."""
-
-ITERATIONS = 200
-"""Most iterations of a fit on one mesh, unless said otherwise."""
-
-MORE_ITERATIONS = 2000
-"""Iterations of a fit that goes on where the first has not converged within those that it was allowed."""
-
-LOWER = 1e-7
-"""Part of the cost by which an end has to be lower to replace the best so far."""
 
 
 def estimate(

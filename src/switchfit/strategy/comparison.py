@@ -28,10 +28,12 @@ from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import FloatArray, robust
 from switchfit.problem.experiment import name_runs
+from switchfit.problem.losses import robust
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_instances, as_labels
+from switchfit.problem.validation.arrays import FloatArray
+from switchfit.problem.validation.names import as_labels
+from switchfit.problem.validation.objects import as_instances
 from switchfit.runtime import special
 from switchfit.runtime.presentation import Displayed, format_line, join_first
 

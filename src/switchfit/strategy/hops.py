@@ -31,13 +31,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.branches import has_corners
-from switchfit.engine.protocol import Evaluation, Matrix
+from switchfit.engine.corners.branches import has_corners
+from switchfit.engine.evaluation import Evaluation, Matrix
 from switchfit.fit.evaluator import Evaluator
 from switchfit.optimize import lapack
-from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.progress import show_detail
 from switchfit.strategy.beam import list_sample_times
 from switchfit.strategy.starts import End, OutOfTimeError, check_time, fit_briefly, make_feasible, prepare_meshes
@@ -91,6 +91,17 @@ MATRICES: tuple[Matrix, ...] = ("exact", "gauss-newton")
 their part of the exact Hessian."""
 
 FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
+
+PLACES = 60
+"""Places along the horizon at which an insertion is tried."""
+
+LENGTHS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
+"""Lengths that are tried, as parts of what the mode has room for."""
+
+REMOVALS = 3
+"""Number of modes whose removal is tried, those with the smallest increase of J first."""
+
+REINSERTIONS = 20
 
 
 def hop_over_samples(problem: Problem, best: End, known: Evaluator | None = None) -> End:
@@ -382,18 +393,6 @@ def look_beyond_corners(
                     models.append((there.cost + found[0], point + found[1]))
                 break
     return [start for _, start in sorted(models, key=lambda model: model[0])[:MOST]]
-
-
-PLACES = 60
-"""Places along the horizon at which an insertion is tried."""
-
-LENGTHS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
-"""Lengths that are tried, as parts of what the mode has room for."""
-
-REMOVALS = 3
-"""Number of modes whose removal is tried, those with the smallest increase of J first."""
-
-REINSERTIONS = 20
 
 
 def can_reinsert(problem: Problem) -> bool:

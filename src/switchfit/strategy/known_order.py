@@ -20,14 +20,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import assume_noise
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.parameter import PriorTerms
+from switchfit.problem.measurements import Measurements
+from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem, keep_with_problem
+from switchfit.problem.reference_signals import ReferenceSignal
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.progress import show_detail
 from switchfit.strategy.beam import REPLAYS, REPLAYS_OF_ORDER, Proposal, Quadratic, follow_order, prepare
 from switchfit.strategy.hops import hop_over_samples
 from switchfit.strategy.starts import End, OutOfTimeError, fit_briefly, make_feasible, prepare_meshes
+
+PASSES = 2
+"""Most passes over all logs, each from the parameters of the last fit. Of the two turns of the benchmark 13 of 48
+starts end right after one, all after two. A third lowers J in none of 17 problems of the benchmark, and took a quarter
+of the time of ten joint tosses."""
+
+SOFTER = 3.0
+"""Standard deviations of a channel that a beam takes for noise where transitions reset the state and nothing good is
+found otherwise. Births are on a grid, and each sample between one and where the state jumps is off by all of the jump.
+With 1, 11 of 16 gearboxes that shift at a speed end right, with 3, 15; with 10, 9 of 16 balls whose speed is measured,
+not 16."""
+
+KNOWN = 2
+"""Runs after which the others begin at the parameters that follow from what has been said of them. The few replays do
+there that suit the parameters of a fit: the beams of 200 runs take 0.84 s in place of 1.27, with the same end."""
+
+SETTLED = 0.5
+"""Part of its grid by which a fit leaves a time where a beam has proposed it."""
+
+LOWER = 1e-6
+"""Part of itself by which J has to fall for another pass."""
 
 
 class Beams:
@@ -129,28 +152,6 @@ class Beams:
 def _solve(A: FloatArray, b: FloatArray, q: FloatArray) -> FloatArray:
     """Return the solution of A x = b that is nearest to q, where A is singular."""
     return np.asarray(q + np.linalg.pinv(A, rcond=1e-10, hermitian=True) @ (b - A @ q))
-
-
-PASSES = 2
-"""Most passes over all logs, each from the parameters of the last fit. Of the two turns of the benchmark 13 of 48
-starts end right after one, all after two. A third lowers J in none of 17 problems of the benchmark, and took a quarter
-of the time of ten joint tosses."""
-
-SOFTER = 3.0
-"""Standard deviations of a channel that a beam takes for noise where transitions reset the state and nothing good is
-found otherwise. Births are on a grid, and each sample between one and where the state jumps is off by all of the jump.
-With 1, 11 of 16 gearboxes that shift at a speed end right, with 3, 15; with 10, 9 of 16 balls whose speed is measured,
-not 16."""
-
-KNOWN = 2
-"""Runs after which the others begin at the parameters that follow from what has been said of them. The few replays do
-there that suit the parameters of a fit: the beams of 200 runs take 0.84 s in place of 1.27, with the same end."""
-
-SETTLED = 0.5
-"""Part of its grid by which a fit leaves a time where a beam has proposed it."""
-
-LOWER = 1e-6
-"""Part of itself by which J has to fall for another pass."""
 
 
 def explain_no_beam(problem: Problem) -> str:

@@ -17,11 +17,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
-from switchfit.problem.data import FloatArray, TerminalConstraint, TransitionCost
+from switchfit.problem.consistency import check_durations
+from switchfit.problem.costs import TerminalConstraint, TransitionCost
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.problem import Problem, check_durations
-from switchfit.problem.structure import Function, Structure, trace_structure
-from switchfit.problem.validation import as_count, as_name, as_names, join_names, require_known, shorten
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Function, Structure
+from switchfit.problem.tracing import trace_structure
+from switchfit.problem.validation.arrays import FloatArray, as_count
+from switchfit.problem.validation.messages import join_names, shorten
+from switchfit.problem.validation.names import as_name, as_names, require_known
+
+Integers = NDArray[np.int64]
+
+PER_SEQUENCE = 3
+"""Hypotheses with the same sequence that are kept, at most: without a limit, all would soon have the same."""
+
+RESERVED = 0.5
+"""Part of the width that is shared out among the numbers of switches; the best of all have the rest."""
+
+SMALLEST = float(np.finfo(float).smallest_subnormal)
+"""Difference of two times of which one is later."""
+
+MULTIPLIER = 1_000_003
+"""Of the hash of sequences, which is exact for short sequences of few modes."""
 
 
 @dataclass(frozen=True)
@@ -165,9 +183,6 @@ def _read_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> dic
     return found
 
 
-Integers = NDArray[np.int64]
-
-
 def refuse_unsupported(problem: Problem, e: int) -> None:
     """Raise ValueError for an experiment that a beam cannot follow."""
     run = problem.experiments[e]
@@ -237,19 +252,6 @@ def list_jumps(run: Experiment, structure: Structure, mesh: Mesh) -> list[tuple[
     maps = [structure.reset_library.index(structure.reset_maps[i]) for i in structure.jumps]
     nodes = np.searchsorted(mesh.times, run.jump_times).tolist()
     return list(zip(nodes, maps, strict=True))
-
-
-PER_SEQUENCE = 3
-"""Hypotheses with the same sequence that are kept, at most: without a limit, all would soon have the same."""
-
-RESERVED = 0.5
-"""Part of the width that is shared out among the numbers of switches; the best of all have the rest."""
-
-SMALLEST = float(np.finfo(float).smallest_subnormal)
-"""Difference of two times of which one is later."""
-
-MULTIPLIER = 1_000_003
-"""Of the hash of sequences, which is exact for short sequences of few modes."""
 
 
 class Rules(NamedTuple):

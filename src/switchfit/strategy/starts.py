@@ -23,16 +23,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.protocol import Evaluation
+from switchfit.engine.evaluation import Evaluation
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import IterationRecord, LinearConstraints, Status
-from switchfit.optimize.qp import nearest_feasible
-from switchfit.problem.data import FloatArray
+from switchfit.optimize.least_distance import nearest_feasible
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import HiddenSwitchError
 from switchfit.runtime.progress import show_detail
 
@@ -42,9 +42,34 @@ ITERATIONS = 60
 TOLERANCE = 1e-5
 """On the KKT residual of a short fit; the fit that ends a strategy has that of `estimate`."""
 
-
 _is_late: ContextVar[Callable[[], bool]] = ContextVar("is_late", default=bool)
 _callback: ContextVar[Callable[[IterationRecord], object] | None] = ContextVar("callback", default=None)
+
+MOST_DRAWN = 2**30
+"""Length of SciPy's Sobol sequences."""
+
+FACTOR = 10.0
+"""Range of an unknown without bounds: a positive guess is divided and multiplied by this factor, on a logarithmic
+scale; any other guess varies by plus or minus so many times its size. Times on a logarithmic scale are drawn on that
+scale, from the time since t0 of the first guess divided by this factor to the end of the horizon."""
+
+MOST = 128
+"""Starts at most; a study of more is what `multistart` is for."""
+
+AGREE = 3
+"""Ends at the lowest cost after which the search may stop."""
+
+SAME_COST = 1e-6
+"""Part of the cost by which two ends of one minimum differ at most."""
+
+MARGIN = 1.02
+"""Horizon over which starts are drawn, in units of the time of the best end: with room for others to end there too."""
+
+FEW = 8
+"""Starts over the whole horizon at a time, until one meets the constraints."""
+
+SAME = 1e-9
+"""Relative difference of J from the time, or of its derivatives, that is rounding."""
 
 
 class OutOfTimeError(Exception):
@@ -150,15 +175,6 @@ def make_feasible(problem: Problem, theta: FloatArray) -> FloatArray:
     return theta
 
 
-MOST_DRAWN = 2**30
-"""Length of SciPy's Sobol sequences."""
-
-FACTOR = 10.0
-"""Range of an unknown without bounds: a positive guess is divided and multiplied by this factor, on a logarithmic
-scale; any other guess varies by plus or minus so many times its size. Times on a logarithmic scale are drawn on that
-scale, from the time since t0 of the first guess divided by this factor to the end of the horizon."""
-
-
 def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
     """Return starts from a scrambled Sobol sequence: (S, d); the first is the problem's initial guess.
 
@@ -217,16 +233,6 @@ def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[floa
     knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.end]])
     fixed = [0, *(np.flatnonzero(where < 0) + 1).tolist(), len(knots) - 1]
     return [(float(knots[a]), float(knots[b]), where[a : b - 1]) for a, b in pairwise(fixed) if b - a > 1]
-
-
-MOST = 128
-"""Starts at most; a study of more is what `multistart` is for."""
-
-AGREE = 3
-"""Ends at the lowest cost after which the search may stop."""
-
-SAME_COST = 1e-6
-"""Part of the cost by which two ends of one minimum differ at most."""
 
 
 class Starts(NamedTuple):
@@ -309,16 +315,6 @@ def _is_enough(costs: FloatArray) -> bool:
     w = 1 + int(np.sum(np.diff(ascending) > SAME_COST * np.abs(ascending[1:])))
     found = int(np.sum(ascending <= ascending[0] + SAME_COST * abs(ascending[0])))
     return found > AGREE and n > w + 2 and w * (n - 1) / (n - w - 2) < w + 0.5
-
-
-MARGIN = 1.02
-"""Horizon over which starts are drawn, in units of the time of the best end: with room for others to end there too."""
-
-FEW = 8
-"""Starts over the whole horizon at a time, until one meets the constraints."""
-
-SAME = 1e-9
-"""Relative difference of J from the time, or of its derivatives, that is rounding."""
 
 
 def is_minimum_time(problem: Problem, fit: Estimate) -> bool:

@@ -46,14 +46,18 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit, invert
 from switchfit.fit.trajectory import Comparison, Trajectory, compare
-from switchfit.problem.data import FloatArray, Measurements, count_from
+from switchfit.problem.data import count_from
 from switchfit.problem.dates import Dates
 from switchfit.problem.experiment import Experiment, show_time
-from switchfit.problem.parameter import PriorTerms
+from switchfit.problem.measurements import Measurements
+from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_level, as_names, join_names, list_columns, shorten
+from switchfit.problem.validation.arrays import FloatArray, as_level
+from switchfit.problem.validation.messages import join_names, shorten
+from switchfit.problem.validation.names import as_names
+from switchfit.problem.validation.tables import list_columns
 from switchfit.runtime import special
-from switchfit.runtime.errors import Issue
+from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import Displayed, Figure, draw_figure, format_line, join_first, validate_on
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.known_order import fix_unknowns
@@ -78,6 +82,9 @@ from switchfit.uncertainty.residuals import (
     measure_widening,
 )
 from switchfit.uncertainty.verdict import Finding, Level, Verdict, build_verdict
+
+NEGLIGIBLE = 1e-10
+"""Singular value of the derivative of the own unknowns, relative to the largest, of a direction that does nothing."""
 
 
 def build_other_problem(estimate: Estimate, other: Any) -> Problem:
@@ -186,10 +193,6 @@ def _complete(new: Measurements, like: Measurements) -> Measurements:
             )
         left_out |= {"loss": like.loss, "loss_scale": like.loss_scale}
     return replace(new, delay=new.delay or like.delay, **left_out)
-
-
-NEGLIGIBLE = 1e-10
-"""Singular value of the derivative of the own unknowns, relative to the largest, of a direction that does nothing."""
 
 
 def whiten_residuals(

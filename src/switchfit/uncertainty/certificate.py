@@ -25,20 +25,22 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.engine.protocol import Evaluation
+from switchfit.engine.evaluation import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper, measure_variation
 from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum, moves_by_itself
 from switchfit.fit.solution import refuse_hidden_switches
 from switchfit.fit.trajectory import compare, replace_values
 from switchfit.optimize import Status
-from switchfit.optimize.matrix import null_space
-from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.inspection import find_bends, find_unread
+from switchfit.optimize.curvature import null_space
+from switchfit.problem.comparisons import find_bends
+from switchfit.problem.constraints import ActiveConstraint
+from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem, require_unknowns
-from switchfit.problem.unknowns import ActiveConstraint
-from switchfit.problem.validation import as_flag, as_instance
+from switchfit.problem.reads import find_unread
+from switchfit.problem.validation.arrays import FloatArray
+from switchfit.problem.validation.objects import as_flag, as_instance
 from switchfit.runtime import special
-from switchfit.runtime.errors import Issue
+from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import Printed, format_line, join_first
 
 LARGEST_GAP = 1e-4
@@ -49,6 +51,31 @@ there with half the steps. They are needed where a mode is moderately stiff: Ome
 two rates of the state, so that the longest steps that are stable for the state (``|lambda| h`` up to 3.3) are up to
 twice too long for Omega, which then grows without bound (LuGre friction: a gap of 1e67, and 1e-6 with half the steps).
 """
+
+WEAK = 0.05
+"""Scaled eigenvalues below this are reported: standard errors along them are 4.5 times those of each unknown alone."""
+
+MOST = 3
+"""Largest number of directions that are reported."""
+
+NAMED = 0.2
+"""Unknowns with less than this part of the largest weight in a direction are not named."""
+
+UNDETERMINED = 1e-10
+"""Scaled eigenvalues below this are zero."""
+
+HALVINGS = 20
+Cost = Callable[[FloatArray], float]
+
+Meaning = Literal["noise", "1 % of J", "1 % of variation"]
+"""Meaning of a rise of J: hidden by noise in 95 % of all cases, 1 % of J, or caused by a change of all measured values
+by 1 % of their variation."""
+
+LARGE_INTEGRATION_ERROR = 1e-6
+"""Relative change of J or of a constraint by halving the steps, above which it counts as inaccurate."""
+
+NEGATIVE = -1e-8
+"""Eigenvalues of the scaled Hessian below this are negative curvature, not rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,21 +307,6 @@ def _list_breaks(evaluator: Evaluator, theta: FloatArray) -> list[FloatArray]:
         for i in where[where >= 0].tolist():
             found[i] = np.append(found[i], problem.late_times(theta, e))
     return found
-
-
-WEAK = 0.05
-"""Scaled eigenvalues below this are reported: standard errors along them are 4.5 times those of each unknown alone."""
-MOST = 3
-"""Largest number of directions that are reported."""
-NAMED = 0.2
-"""Unknowns with less than this part of the largest weight in a direction are not named."""
-UNDETERMINED = 1e-10
-"""Scaled eigenvalues below this are zero."""
-HALVINGS = 20
-Cost = Callable[[FloatArray], float]
-Meaning = Literal["noise", "1 % of J", "1 % of variation"]
-"""Meaning of a rise of J: hidden by noise in 95 % of all cases, 1 % of J, or caused by a change of all measured values
-by 1 % of their variation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -587,13 +599,6 @@ def _try_direction(
             break
         change = 0.5 * change
     return change, rises
-
-
-LARGE_INTEGRATION_ERROR = 1e-6
-"""Relative change of J or of a constraint by halving the steps, above which it counts as inaccurate."""
-
-NEGATIVE = -1e-8
-"""Eigenvalues of the scaled Hessian below this are negative curvature, not rounding."""
 
 
 @dataclass(frozen=True)

@@ -37,18 +37,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of
-from switchfit.engine.protocol import Simulation, Tangents, runs_of
+from switchfit.engine.run import runs_of
+from switchfit.engine.simulation import Simulation, Tangents
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import find_delay, read_times, select_visible
-from switchfit.problem.data import FloatArray, influence
-from switchfit.problem.dates import Origin
+from switchfit.meshes.refinement import refine_mesh
 from switchfit.problem.experiment import show_time
-from switchfit.problem.parameter import Parameter, unit_suffix
+from switchfit.problem.losses import influence
+from switchfit.problem.origin import Origin
+from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_index, as_instance, as_level
+from switchfit.problem.validation.arrays import FloatArray, as_index, as_level
+from switchfit.problem.validation.messages import unit_suffix
+from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Figure, draw_figure, format_html, format_line, join_first
 
@@ -161,7 +164,7 @@ class SampleDerivatives(NamedTuple):
     item : (S,) int
         Index of the Measurements in the experiment.
     residual, weight, influence : (S,)
-        Fitted minus measured, ``1 / sigma**2`` (1 if sigma is unknown), and rho' of the loss (`problem.data`).
+        Fitted minus measured, ``1 / sigma**2`` (1 if sigma is unknown), and rho' of the loss (`problem.losses`).
     derivative : (S, d)
         Derivative of the fitted value in theta.
     """

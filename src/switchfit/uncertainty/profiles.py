@@ -43,11 +43,12 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Status
-from switchfit.optimize.qp import nearest_feasible
-from switchfit.problem.data import FloatArray
-from switchfit.problem.parameter import unit_suffix
+from switchfit.optimize.least_distance import nearest_feasible
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_flag, as_instance, as_level, as_name, join_names, shorten
+from switchfit.problem.validation.arrays import FloatArray, as_level
+from switchfit.problem.validation.messages import join_names, shorten, unit_suffix
+from switchfit.problem.validation.names import as_name
+from switchfit.problem.validation.objects import as_callable, as_flag, as_instance
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
 from switchfit.runtime.progress import Progress, show_progress
@@ -55,23 +56,32 @@ from switchfit.uncertainty.residuals import measure_widening
 from switchfit.uncertainty.walks import eliminate_others, find_first_root, list_sample_times, list_transitions
 
 End = Literal["crossed", "limit", "flat", "failed", "stopped"]
+
 STEPS = 5
 """Points between the estimate and the crossing of the threshold, on each side."""
+
 BEYOND = 1.15
 """The march continues until zeta is this many times the threshold ..."""
+
 LOOK_AHEAD = 3
 """... and then adds this many points for a second region, each twice as far out as the one before; twice as many while
 the cost falls outwards."""
+
 MOST_POINTS = 60
 """Largest number of points on one side."""
+
 LONGEST_GROWTH = 2.5
 """Largest ratio of a step to the one before."""
+
 FAR = 1e2
 """A side is flat if the threshold is not crossed up to this many times the unknown's size or its standard error."""
+
 HALVINGS = 8
 """Largest number of times that a step is reduced because a fit fails or zeta rises too much."""
+
 ITERATIONS = 100
 """Largest number of iterations of one fit along the profile."""
+
 CREEPING = 1e-3
 """Fall of J in the second half of them, as a part of that in one unit of zeta, below which the fit has ended too."""
 

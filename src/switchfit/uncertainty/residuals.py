@@ -39,10 +39,10 @@ from numpy.typing import NDArray
 from switchfit.fit.evaluator import NO_VARIATION
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
-from switchfit.problem.data import FloatArray
-from switchfit.problem.dates import Origin
+from switchfit.problem.origin import Origin
+from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime import special
-from switchfit.runtime.errors import Issue
+from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import Printed, format_line, join_first
 
 UNLIKELY = 1e-3

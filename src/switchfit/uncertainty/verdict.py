@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from switchfit.fit.result import NAMED, Fit, disagreement, list_without_effect
 from switchfit.optimize import Status
-from switchfit.problem.inspection import name_whole_parameters
-from switchfit.runtime.errors import Issue
+from switchfit.problem.reads import name_whole_parameters
+from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import Printed
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, Certificate, analyse_solution, certify
 from switchfit.uncertainty.residuals import HALF, NO_RESIDUALS, UNLIKELY, Quality, find_residual_issues, measure_quality
@@ -57,9 +57,61 @@ BARELY_DETERMINED = 1e-6
 """Smallest eigenvalue of the Hessian, scaled to unit curvature, below which a direction is not determined: correlations
 of 0.999999 have it."""
 
-
 VANISHING = 10.0
 """Standard errors of an unknown on a logarithmic scale, in parts of it, above which the data do not tell it from 0."""
+
+UNSEEN = 100.0
+"""Factor between the standard errors of the two Hessians above which the Gauss-Newton matrix counts as singular, as for
+a transition at which the vector field does not jump, such as a block that comes to rest."""
+
+DIFFERENT = 1.2
+"""Factor between the standard errors of the two Hessians, for any combination of the unknowns, above which a warning is
+given: a 95 % interval that is too narrow by this factor covers 90 %, one that is too wide 98 %."""
+
+ELSEWHERE = ("more starts", "look at the residuals")
+"""What to do about a model that does not fit: the minimum may be a local one, or the model wrong."""
+
+SUSPECTED = {
+    "model": ("look at the residuals", "corrected errors"),
+    "outliers": ("robust loss",),
+    "sigma": ("check sigma",),
+}
+"""What to do about residuals that are no noise, by what is suspected."""
+
+FIX = "fix or add data"
+"""What to do about unknowns that are not determined, which are the subjects of this advice."""
+
+NO_EFFECT = {"not read": "remove or use", "acts elsewhere": "fix or let it act", "without effect": "fix alone"}
+"""What to do about unknowns on which J does not depend, by the kind of reason; they are the subjects of the advice."""
+
+ENDED = {
+    Status.MAX_ITERATIONS: ("raise max_iterations", "more starts"),
+    Status.INTERRUPTED: ("continue",),
+    Status.NONFINITE_START: ("start elsewhere",),
+    Status.INFEASIBLE: ("start nearer",),
+}
+"""What to do about a fit that did not converge, by its status; otherwise more starts."""
+
+SEARCH_FAILED = {"switch": (), "wrong slope": ("check derivatives", "more starts"), "rounding": ("larger tolerance",)}
+"""What to do about a line search that failed, by the reason; otherwise more starts. About a switch: see `SWITCH`."""
+
+DEFINE = "define it there"
+"""What to do about an operation of a function that is not defined, or has no derivative, at a point."""
+
+WRITTEN_OTHERWISE = {"undefined": DEFINE, "cost corner": "cost as a state"}
+"""What to do about a function that kept a fit from converging, by the kind of the reason."""
+
+SWITCH = "transition time"
+"""What to do about an unknown with which a function compares, the first of the subjects of this advice."""
+
+OTHER_SIDE = "other side"
+"""What to do about transition times that are held by jumps at known times, the subjects of this advice."""
+
+PROFILES = "look at profiles"
+"""What to do about transition times that may be elsewhere, the subjects of this advice."""
+
+OF_SUBJECTS = {DEFINE, FIX, SWITCH, OTHER_SIDE, PROFILES, *NO_EFFECT.values()}
+"""Advice that is about the subjects of its reason."""
 
 
 @dataclass(frozen=True)
@@ -171,14 +223,6 @@ def find_levels(doubts: list[Doubt], count: int) -> NDArray[np.str_]:
     for doubt in doubts:
         places[doubt.which] = np.maximum(places[doubt.which], LEVELS.index(doubt.level))
     return np.array(LEVELS)[places]
-
-
-UNSEEN = 100.0
-"""Factor between the standard errors of the two Hessians above which the Gauss-Newton matrix counts as singular, as for
-a transition at which the vector field does not jump, such as a block that comes to rest."""
-DIFFERENT = 1.2
-"""Factor between the standard errors of the two Hessians, for any combination of the unknowns, above which a warning is
-given: a 95 % interval that is too narrow by this factor covers 90 %, one that is too wide 98 %."""
 
 
 def find_issues(fit: Fit) -> Iterator[Issue]:
@@ -410,52 +454,6 @@ def _list_numbers(fit: Fit, quality: Quality | None) -> Numbers:
         freedom=np.inf if fit.sigma_known is None else fit.freedom,
         references=any(channel.kind == "reference" for channel in quality.channels),
     )
-
-
-ELSEWHERE = ("more starts", "look at the residuals")
-"""What to do about a model that does not fit: the minimum may be a local one, or the model wrong."""
-
-SUSPECTED = {
-    "model": ("look at the residuals", "corrected errors"),
-    "outliers": ("robust loss",),
-    "sigma": ("check sigma",),
-}
-"""What to do about residuals that are no noise, by what is suspected."""
-
-FIX = "fix or add data"
-"""What to do about unknowns that are not determined, which are the subjects of this advice."""
-
-NO_EFFECT = {"not read": "remove or use", "acts elsewhere": "fix or let it act", "without effect": "fix alone"}
-"""What to do about unknowns on which J does not depend, by the kind of reason; they are the subjects of the advice."""
-
-ENDED = {
-    Status.MAX_ITERATIONS: ("raise max_iterations", "more starts"),
-    Status.INTERRUPTED: ("continue",),
-    Status.NONFINITE_START: ("start elsewhere",),
-    Status.INFEASIBLE: ("start nearer",),
-}
-"""What to do about a fit that did not converge, by its status; otherwise more starts."""
-
-SEARCH_FAILED = {"switch": (), "wrong slope": ("check derivatives", "more starts"), "rounding": ("larger tolerance",)}
-"""What to do about a line search that failed, by the reason; otherwise more starts. About a switch: see `SWITCH`."""
-
-DEFINE = "define it there"
-"""What to do about an operation of a function that is not defined, or has no derivative, at a point."""
-
-WRITTEN_OTHERWISE = {"undefined": DEFINE, "cost corner": "cost as a state"}
-"""What to do about a function that kept a fit from converging, by the kind of the reason."""
-
-SWITCH = "transition time"
-"""What to do about an unknown with which a function compares, the first of the subjects of this advice."""
-
-OTHER_SIDE = "other side"
-"""What to do about transition times that are held by jumps at known times, the subjects of this advice."""
-
-PROFILES = "look at profiles"
-"""What to do about transition times that may be elsewhere, the subjects of this advice."""
-
-OF_SUBJECTS = {DEFINE, FIX, SWITCH, OTHER_SIDE, PROFILES, *NO_EFFECT.values()}
-"""Advice that is about the subjects of its reason."""
 
 
 def _explain(fit: Fit, quality: Quality | None, doubt: Doubt) -> Iterator[Finding]:

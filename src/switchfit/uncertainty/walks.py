@@ -46,8 +46,8 @@ from numpy.typing import NDArray
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
-from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.problem.validation.arrays import FloatArray
 
 MOST_HALVINGS = 3
 """Times on one side that a piece is cut off halfway to the end of the interval that it predicts ..."""
@@ -79,6 +79,35 @@ so short, and the integration unstable."""
 
 PIECE = 5
 """Numbers of a piece."""
+
+MOST_PIECES = 60
+"""Sample times that are passed in one direction; with more of them in an interval the kinks average out."""
+
+MOST_RUNS = 15
+"""Problems of more experiments, whose evaluations take long, keep the intervals of one parabola."""
+
+NEAR = 5.0
+"""Pieces are traced if a sample lies within this many standard errors, twice as far as a 99 % interval reaches. Where
+most of what is known about a transition time comes from the samples next to it, its profile is far from a parabola
+before it reaches them."""
+
+JUMP = 0.9
+"""Part of the rise of J up to a piece of which the piece before it says nothing where J jumps between them."""
+
+BISECTIONS = 40
+"""Halvings of a piece until its crossing of the threshold is known to rounding."""
+
+HIGHEST_LEVEL = 0.99
+"""Pieces are traced up to the end of an interval of this level, whatever lower level is asked for."""
+
+HIGHEST_RISE = 8.0
+"""Rise of J, in variances of the noise, up to which the density of a transition time with a reset map is followed."""
+
+LEAST_JUMP = 0.25
+"""Jump of J between two pieces, in variances of the noise, that is no error of parabolas."""
+
+POINTS = 41
+"""Points of a piece at which a density is taken."""
 
 
 class Derivatives(NamedTuple):
@@ -454,36 +483,6 @@ def find_first_root(height: FloatArray, slope: FloatArray, curvature: FloatArray
         # a root that is not positive mean that the parabola never gets so high.
         root = slope + np.sqrt(slope * slope + 2.0 * curvature * height)
         return np.where(root > 0.0, 2.0 * height / root, np.inf)
-
-
-MOST_PIECES = 60
-"""Sample times that are passed in one direction; with more of them in an interval the kinks average out."""
-
-MOST_RUNS = 15
-"""Problems of more experiments, whose evaluations take long, keep the intervals of one parabola."""
-
-NEAR = 5.0
-"""Pieces are traced if a sample lies within this many standard errors, twice as far as a 99 % interval reaches. Where
-most of what is known about a transition time comes from the samples next to it, its profile is far from a parabola
-before it reaches them."""
-
-JUMP = 0.9
-"""Part of the rise of J up to a piece of which the piece before it says nothing where J jumps between them."""
-
-BISECTIONS = 40
-"""Halvings of a piece until its crossing of the threshold is known to rounding."""
-
-HIGHEST_LEVEL = 0.99
-"""Pieces are traced up to the end of an interval of this level, whatever lower level is asked for."""
-
-HIGHEST_RISE = 8.0
-"""Rise of J, in variances of the noise, up to which the density of a transition time with a reset map is followed."""
-
-LEAST_JUMP = 0.25
-"""Jump of J between two pieces, in variances of the noise, that is no error of parabolas."""
-
-POINTS = 41
-"""Points of a piece at which a density is taken."""
 
 
 def replace_intervals(

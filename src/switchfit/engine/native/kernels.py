@@ -1,4 +1,6 @@
-"""Straight-line functions for rows and nodes: `switchfit.discretization.rows`, with derivatives as vectors over theta.
+"""Straight-line functions for rows and nodes, with derivatives as vectors over theta.
+
+The equations are those of `switchfit.discretization.rows`.
 
 A straight-line function reads and writes through pointers. The name of a pointer means the same in all functions:
 
@@ -9,7 +11,7 @@ A straight-line function reads and writes through pointers. The name of a pointe
     X, XZ           at the stages of a row: (s, n), (s, n, width)
                     at those of an implicit row that moves with theta, also its slopes behind them: (2 s, ...)
     kept            functions of the C library at the stages of a row, for its backward step: (s, count); then the
-                    factors of the coupled equations of an implicit row: see `arrays`
+                    factors of the coupled equations of an implicit row: see `elimination`
     increments      increments of an implicit row: (s, n)
     newton          of the increments: 0 if their last change was small for the largest state, else 1; 1 if they have
                     converged, else 0
@@ -36,28 +38,33 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.discretization import rows
+from switchfit.discretization import row_errors, rows, tableaus
 from switchfit.discretization.model import AT_TRANSITIONS
-from switchfit.discretization.rows import EXPLICIT, STIFF, Stages, Tableau, Tangent, combine, times_vector
-from switchfit.engine.native.arrays import Elimination, Routine, count_factors, eliminate
-from switchfit.engine.native.llvm import Module
-from switchfit.engine.native.scalars import CHECKED, MAY_FAIL, Graph, Namespace, Node, Objects, Template
-from switchfit.engine.native.templates import COST_TO_GO, ELL, ELL_X, F_P, F_T, F_X, SLOPES, F, Order, Sizes, Templates
+from switchfit.discretization.rows import Stages, Tangent, combine, times_vector
+from switchfit.discretization.tableaus import EXPLICIT, STIFF, Tableau
+from switchfit.engine.native.elimination import Elimination, Routine, eliminate
+from switchfit.engine.native.layout import MOST_KEPT_VALUES, has_jumps
+from switchfit.engine.native.llvm.module import Module
+from switchfit.engine.native.scalars.graph import CHECKED, Graph, Namespace, Node, Objects
+from switchfit.engine.native.scalars.operations import MAY_FAIL
+from switchfit.engine.native.scalars.template import Template
+from switchfit.engine.native.sizes import Order, Sizes
+from switchfit.engine.native.templates import COST_TO_GO, ELL, ELL_X, F_P, F_T, F_X, SLOPES, F, Templates
 from switchfit.problem.structure import Structure
-
-STAGES = len(EXPLICIT.b)
-"""Stages of a row, or stages and slopes of an implicit one, that have memory."""
 
 Store = tuple[str, int, Node]
 Places = list[tuple[int, int]]
+
 Second = dict[tuple[int, int], Node]
 """Entries of a second derivative along (t, x, p), by their places: the lower half, or less."""
+
 Factors = Elimination | Routine | None
 """Those of the coupled equations of an implicit row; None for an explicit one."""
+
 Along = list[tuple[Any, list[Node]]]
 """Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
 
-NOTHING: tuple[Any, list[Node]] = (None, [])
+NO_DERIVATIVE: tuple[Any, list[Node]] = (None, [])
 """The derivative of a time that does not depend on theta."""
 
 JUMP_WEIGHT = 1e4
@@ -70,27 +77,12 @@ CHANGE, SMALLEST_CHANGE = 1e-10, 1e-12
 """Relative change of a state at a stage in the last iteration of Newton's method, whose error is the square of the
 change before; and the change relative to the largest state at which rounding errors may be all that is left."""
 
-SHORT = 120
+MOST_CURVATURE_AT_ONCE = 120
 """Largest n D, times the number of modes, for which one function adds the curvature of all stages; above it, each call
 adds one stage: compiling these functions would take longer than all others."""
 
 
-MOST_KEPT = 2
-"""Values of functions that are kept at most at each stage, in n: as many as sines and cosines of all states."""
-
-
-def count_kept(library: Structure, n: int, order: Order) -> int:
-    """Return how many doubles a row keeps at most for its backward step."""
-    has_factors = order > Order.COST and any(library.implicit)
-    return STAGES * MOST_KEPT * n + (count_factors(n, len(STIFF.b)) if has_factors else 0)
-
-
-def has_jumps(library: Structure) -> bool:
-    """Return whether the costate may jump at the end of a row: at samples and nodes of transitions."""
-    return bool(library.measurements) or any(getattr(library, kind) for kind in AT_TRANSITIONS)
-
-
-class Curvature(NamedTuple):
+class CurvatureFunction(NamedTuple):
     """A function that adds the second derivatives of the stages of a row to H.
 
     Attributes
@@ -121,7 +113,7 @@ class Kernels:
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
         self.has_jumps = has_jumps(library)
         self.chosen: Places = []
-        self._curvatures: dict[tuple[int, tuple[tuple[int, int], ...]], Curvature] = {}
+        self._curvatures: dict[tuple[int, tuple[tuple[int, int], ...]], CurvatureFunction] = {}
 
     def tableau(self, mode: int) -> Tableau:
         """Return the method of a mode."""
@@ -250,9 +242,9 @@ class Kernels:
         at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
         if tableau.coupled:
             slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
-            error = rows.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
+            error = row_errors.estimate_error(h, self.load_increments(graph), slope, jacobian, eliminate)
         else:
-            error = h * combine(rows.EXPLICIT_ERROR, found.slopes)
+            error = h * combine(tableaus.EXPLICIT_ERROR, found.slopes)
         # The larger of the error so far and that of this step, relative to rtol (smallest + |x|).
         (rtol, smallest), xp, largest = graph.loads("tolerances", 2), Namespace(graph), graph.load("error", 0)
         for relative in xp.abs(error) / (rtol * (smallest + xp.abs(x))):
@@ -285,10 +277,10 @@ class Kernels:
         if tableau.coupled:
             slope, f_x = stage(graph, *at(graph.load("row", 0), x), only=(F, F_X))
             k = [combine(row, [X - x for X in after]) for row in inverse]
-            errors = rows.estimate_error(h, k, slope, f_x, eliminate)
+            errors = row_errors.estimate_error(h, k, slope, f_x, eliminate)
         else:
             # sum_j e_j h K_j with h K = inverse (X - x): the weights of the states, and what they leave of x.
-            weights = rows.EXPLICIT_ERROR @ inverse
+            weights = tableaus.EXPLICIT_ERROR @ inverse
             errors = combine(weights, after) - weights.sum() * x
         self._add_to_errors(f"error_{mode}", graph, Namespace(graph).abs(errors))
 
@@ -297,13 +289,13 @@ class Kernels:
         # The middle stage and the bend see a jump that the first and the last one straddle; see `rows.measure_jump`.
         changes = [X - x for X in after]
         first, middle, last = (combine(inverse[j], changes) for j in (0, len(inverse) // 2, -1))
-        bend = combine((rows.STIFF_BEND if tableau.coupled else rows.EXPLICIT_BEND) @ inverse, changes)
+        bend = combine((tableaus.STIFF_BEND if tableau.coupled else tableaus.EXPLICIT_BEND) @ inverse, changes)
         times = [graph.load("row", 0) + c * h for c in tableau.c[[0, -1]].tolist()]
         ends = [stage(graph, *at(t, X), only=(F_T, F_X)) for t, X in zip(times, (states[0], states[-1]), strict=True)]
         # The mean of the derivatives at both ends times the change of (t, X) is how f would change if it were smooth.
         f_t, f_x = (one + other for one, other in zip(*ends, strict=True))
         smooth = 0.5 * h * (times_vector(f_x, states[-1] - states[0]) + f_t * (times[1] - times[0]))
-        jump = rows.measure_jump(first, middle, last, bend, smooth, Namespace(graph))
+        jump = row_errors.measure_jump(first, middle, last, bend, smooth, Namespace(graph))
         self._add_to_errors(f"jump_{mode}", graph, JUMP_WEIGHT * jump)
 
     def _load_row(self, graph: Graph, tableau: Tableau) -> tuple[Objects, Node, list[Objects], list[Objects]]:
@@ -406,7 +398,7 @@ class Kernels:
             stores += [each[key] for key in chosen] + [graph.constant(c_j)] * _has_time(chosen)
         return chosen, store_all("entries", 0, stores)
 
-    def curvature(self, name: str, chosen: Places, tableau: Tableau) -> Curvature:
+    def curvature(self, name: str, chosen: Places, tableau: Tableau) -> CurvatureFunction:
         """Return the function ``H += Z' S Z`` at all stages of a row or at one, for entries of S from `backward_row`;
         write it unless an earlier row has the same entries.
 
@@ -416,16 +408,16 @@ class Kernels:
         stages = len(tableau.b)
         key = stages, tuple(chosen)
         if key in self._curvatures or not chosen:
-            return self._curvatures.get(key, Curvature())
+            return self._curvatures.get(key, CurvatureFunction())
         graph, n, D = Graph(), self.sizes.n, self.sizes.D
         H = [graph.load("H", d, vector=True) for d in range(D)]
         sums = H
         moving = _has_time(chosen)
         # One function for all stages of a row, else for each, since it would be too long.
-        size, at_once = len(chosen) + moving, stages if n * D * len(self.library.modes) <= SHORT else 1
+        size, at_once = len(chosen) + moving, stages if n * D * len(self.library.modes) <= MOST_CURVATURE_AT_ONCE else 1
         for j in range(at_once):
             second = {key: graph.load("entries", j * size + k) for k, key in enumerate(chosen)}
-            of_time = NOTHING
+            of_time = NO_DERIVATIVE
             if moving:
                 # t_j' = start' + c_j h'; c_j comes from memory because a function for one stage is called for each of
                 # them.
@@ -436,7 +428,7 @@ class Kernels:
                 of_time = start_d + c_j * (end_d - start_d), entries
             sums = self._add_curvature(graph, sums, second, [of_time, *self._directions(graph, "XZ", n, j * n)])
         self.module.write_straight_line(name, _store_changed_rows(H, sums))
-        self._curvatures[key] = Curvature(name, size, range(0, stages, at_once))
+        self._curvatures[key] = CurvatureFunction(name, size, range(0, stages, at_once))
         return self._curvatures[key]
 
     def length(self) -> None:
@@ -567,7 +559,7 @@ class Kernels:
         where both steps compute them.
         """
         outputs = (F, *((F_T, F_X, F_P) if self.order > Order.COST else ()), *((ELL,) if costs else ()))
-        most = MOST_KEPT * self.sizes.n if self.goes_back else 0
+        most = MOST_KEPT_VALUES * self.sizes.n if self.goes_back else 0
         return outputs, stage.list_long(outputs)[:most]
 
     def _load_constants(self, graph: Graph) -> tuple[Objects, list[Objects]]:
@@ -622,7 +614,7 @@ class Kernels:
             g = g + g_t.item() * graph.load("moves", 0, vector=True)
         stores = [("g", 0, as_vector(graph, g))]
         H = [graph.load("H", d, vector=True) for d in range(self.sizes.D)]
-        of_time = self._directions(graph, "moves", 1) if moving else [NOTHING]
+        of_time = self._directions(graph, "moves", 1) if moving else [NO_DERIVATIVE]
         along = [*of_time, *self._directions(graph, "Z", self.sizes.n)]
         sums = self._add_curvature(graph, H, list_entries(second, with_time=moving), along)
         return stores + _store_changed_rows(H, sums)

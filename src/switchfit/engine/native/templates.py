@@ -1,84 +1,30 @@
-"""Trace the functions of a model and their derivatives into templates, from which kernels are written."""
+"""Templates of a model: its functions and their derivatives, traced once, from which kernels are written."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from enum import IntEnum
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from switchfit.discretization.mesh import Arguments, Samples
-from switchfit.discretization.model import Model, Piece, apply_weights, get_transition_function
-from switchfit.engine.native.scalars import Template
-from switchfit.engine.native.trace import trace_scalars
+from switchfit.discretization.arguments import Arguments, Samples
+from switchfit.discretization.model import Model, apply_weights, get_transition_function
+from switchfit.discretization.signals import Piece
+from switchfit.engine.native.scalars.template import Template
+from switchfit.engine.native.sizes import Order, Shape, Sizes
+from switchfit.engine.native.tracing.trace import trace_scalars
 from switchfit.problem.structure import Structure
 
-Shape = tuple[int, ...]
-
 F, F_T, F_X, F_P, ELL, _, ELL_X = range(7)
+
 SLOPES = tuple(range(8))
 """Positions in the outputs of `Templates.stage`: f, D_2 f, D_1 f, D_p f, ell and its derivatives in t, x and p."""
 
 COST_TO_GO = (8, 9, 10, 11)
 """Positions of the derivatives of ``w . f + hb ell``: first in t, x and p; second along (t, x, p), as one matrix."""
-
-
-class Order(IntEnum):
-    """What a program computes: J alone, with the gradient, and with the Hessian or the Gauss-Newton matrix too."""
-
-    COST = 0
-    GRADIENT = 1
-    HESSIAN = 2
-    GAUSS_NEWTON = 3
-
-
-class Sizes(NamedTuple):
-    """Sizes on which a program depends, in addition to the library.
-
-    Attributes
-    ----------
-    n, N, M : numbers of states, of transitions at most, and of entries of p
-    T : number of transition times with derivatives: all but those of jumps, which are known
-    signals : number of channels of all signals
-    m : number of terminal constraints
-    constants : shapes of the fixed parameters, the weights of references and the initial state
-    """
-
-    n: int
-    N: int
-    T: int
-    M: int
-    signals: int
-    m: int
-    constants: tuple[Shape, ...]
-
-    @classmethod
-    def of(cls, structure: Structure, arguments: Arguments) -> Sizes:
-        """Return the sizes of one experiment."""
-        constants = tuple(np.shape(a) for a in constants_of(arguments))
-        count = structure.terminal_constraint_count
-        N = structure.transitions
-        return cls(structure.n, N, N - structure.known, structure.M, arguments.signals.shape[2], count, constants)
-
-    @property
-    def D(self) -> int:
-        """Number of unknowns: all transition times but those of jumps, then p."""
-        return self.T + self.M
-
-    @property
-    def width(self) -> int:
-        """Number of entries of a vector: even above 1, to suit the vector instructions of the CPU."""
-        return self.D if self.D == 1 else self.D + self.D % 2
-
-
-def constants_of(arguments: Arguments) -> list[Any]:
-    """Return the arrays that functions of the model read in addition to t, x, p and signals."""
-    return [*arguments.fixed, *arguments.weights, arguments.initial_state]
 
 
 class Templates:

@@ -12,19 +12,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.io.logs.log import Event, Log, Options, build_log
-from switchfit.io.logs.text import decode
-from switchfit.runtime.errors import InputError, Issue, import_library
+from switchfit.io.logs.columns import build_log
+from switchfit.io.logs.decoding import decode
+from switchfit.io.logs.log import Event, Log
+from switchfit.io.logs.options import Options
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.extras import import_library
+from switchfit.runtime.issue import Issue
 
-UNITS = {
+GPS_UNITS = {
     "latitude": "deg", "longitude": "deg", "altitude": "m", "speed": "m/s", "course": "deg", "hdop": "", "quality": "",
     "satellites": "", "sigma_east": "m", "sigma_north": "m", "sigma_up": "m",
 }  # fmt: skip
+
 KNOT = 1852 / 3600
 """Metres per second."""
-DAY = 86_400_000_000
+
+MICROSECONDS_PER_DAY = 86_400_000_000
 """Microseconds."""
+
 EPOCH = date(1970, 1, 1)
+
+_CHANNELS = {
+    "GGA": {"altitude": "altitude", "quality": "gps_qual", "satellites": "num_sats", "hdop": "horizontal_dil"},
+    "GNS": {"altitude": "altitude", "satellites": "num_sats", "hdop": "hdop"},
+    "RMC": {"speed": "spd_over_grnd", "course": "true_course"},
+    "GST": {"sigma_east": "std_dev_longitude", "sigma_north": "std_dev_latitude", "sigma_up": "std_dev_altitude"},
+}
+"""Of each kind of sentence, the channels besides the position, and what pynmea2 calls them."""
 
 
 def read_gpx(path: Path, options: Options) -> Log:
@@ -46,7 +61,7 @@ def read_gpx(path: Path, options: Options) -> Log:
         raise InputError(f"{path} has no track with times: of {len(points)} points, none has a time.")
     times = np.array([None if p.time is None else _count_micros(p.time) for p in points], dtype="datetime64[us]")
     fields = {"altitude": "elevation", "hdop": "horizontal_dilution"}
-    records = [{name: getattr(point, fields.get(name, name), None) for name in UNITS} for point in points]
+    records = [{name: getattr(point, fields.get(name, name), None) for name in GPS_UNITS} for point in points]
     log = _build_log(path, times, records, options, place="point")
     named = [point for point in gpx.waypoints if point.time and point.name]
     events = [Event(_count_micros(point.time) * 1e-6 - log.offset, "waypoint", point.name) for point in named]
@@ -105,15 +120,6 @@ def _parse_sentences(pynmea2: Any, text: str, damaged: list[int]) -> Iterator[tu
             damaged.append(line)
 
 
-_CHANNELS = {
-    "GGA": {"altitude": "altitude", "quality": "gps_qual", "satellites": "num_sats", "hdop": "horizontal_dil"},
-    "GNS": {"altitude": "altitude", "satellites": "num_sats", "hdop": "hdop"},
-    "RMC": {"speed": "spd_over_grnd", "course": "true_course"},
-    "GST": {"sigma_east": "std_dev_longitude", "sigma_north": "std_dev_latitude", "sigma_up": "std_dev_altitude"},
-}
-"""Of each kind of sentence, the channels besides the position, and what pynmea2 calls them."""
-
-
 def _read_channels(sentence: Any) -> dict[str, float]:
     """Return the channels that a sentence has; the position only if there is a fix."""
     numbers = {name: _read_float(getattr(sentence, own)) for name, own in _CHANNELS[sentence.sentence_type].items()}
@@ -145,9 +151,9 @@ def _read_float(given: Any) -> float | None:
 def _count_fixes(fixes: list[dict[str, Any]]) -> NDArray[np.int64]:
     """Return microseconds of all fixes, since 1970 if a sentence states the date; days go on after midnight."""
     clocks = np.array([_count_micros(datetime.combine(EPOCH, fix["clock"].replace(tzinfo=UTC))) for fix in fixes])
-    midnights = np.cumsum(np.append(0, np.diff(clocks) < -DAY // 2))
+    midnights = np.cumsum(np.append(0, np.diff(clocks) < -MICROSECONDS_PER_DAY // 2))
     dated = ((fix["day"] - EPOCH).days - night for fix, night in zip(fixes, midnights, strict=True) if fix["day"])
-    return (midnights + next(dated, 0)) * DAY + clocks
+    return (midnights + next(dated, 0)) * MICROSECONDS_PER_DAY + clocks
 
 
 def _count_micros(moment: datetime) -> int:
@@ -157,7 +163,7 @@ def _count_micros(moment: datetime) -> int:
 
 def _build_log(path: Path, times: Any, records: list[dict[str, Any]], options: Options, **more: Any) -> Log:
     """Return a log of the channels that have a value; its times are stamps of a receiver."""
-    columns = {name: np.array([record.get(name) for record in records], dtype=np.float64) for name in UNITS}
+    columns = {name: np.array([record.get(name) for record in records], dtype=np.float64) for name in GPS_UNITS}
     kept = {name: column for name, column in columns.items() if np.isfinite(column).any()}
-    log = build_log(str(path), {"time": times, **kept}, UNITS | {"time": "s"}, options, zones={"time": "UTC"})
+    log = build_log(str(path), {"time": times, **kept}, GPS_UNITS | {"time": "s"}, options, zones={"time": "UTC"})
     return replace(log, has_positions=True, has_dates=False, **more)

@@ -1,9 +1,8 @@
-"""`Log`: times, named channels with units, and what is odd about them; made from columns of which one has the times."""
+"""`Log`: times, named channels with units, and what is odd about them."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple, overload
@@ -11,87 +10,15 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.io.logs import refuse_without_times
-from switchfit.problem.dates import SECONDS, TIME_UNITS, Dates
-from switchfit.problem.validation import join_names, shorten
-from switchfit.runtime.errors import InputError, Issue
+from switchfit.problem.dates import Dates
+from switchfit.problem.time_units import SECONDS_OF_UNIT
+from switchfit.problem.validation.messages import join_names, shorten
+from switchfit.runtime.errors import InputError
 from switchfit.runtime.frames import Column, Frame, build_pandas
+from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_line, join_first
 
-EPOCH_SECONDS = (9.4e8, 2.6e9)
-"""Between which numbers seconds since 1970 lie: the years 1999 to 2052."""
-
-_PREFIXED = (
-    "m", "s", "g", "rad", "Hz", "N", "Nm", "Pa", "V", "A", "W", "J", "K", "T", "G", "F", "H", "C", "Ohm", "Ω", "bar",
-    "l", "L", "px",
-)  # fmt: skip
-_PLAIN = (
-    "1", "-", "%", "°", "deg", "degree", "degrees", "grad", "rad", "°C", "degC", "°F", "°/s", "min", "h", "d", "rpm",
-    "ticks", "tick", "counts", "count", "pix", "pixel", "pixels", "ft", "in", "mi", "kn", "kt", "kts", "knots", "mph",
-    "kph", "psi", "rev", "bit", "bool", "fps", "sec", "msec", "usec", "nsec", "mol", "lx", "dB", "mps", "kmh",
-)  # fmt: skip
-_FACTOR = re.compile(
-    rf"(?:{'|'.join(re.escape(u) for u in sorted(_PLAIN, key=len, reverse=True))}"
-    rf"|[nuµμmckMG]?(?:{'|'.join(re.escape(u) for u in sorted(_PREFIXED, key=len, reverse=True))}))"
-    r"(?:\^?-?\d|\*\*-?\d|[²³⁻¹]+)?"
-)
-_SUFFIX = re.compile(r"[^_]_(ns|us|ms|s|sec|min|rad|deg|m|mm|cm|km|Hz|rpm|mps|Nm)$")
-
-
-def is_unit(text: str) -> bool:
-    """Return whether a text is a unit, such as ``m/s^2``, ``°C``, ``ticks`` or ``[rad/s]``."""
-    inner = strip_brackets(text)
-    if not inner:
-        return False
-    factors = re.split(r"[/*·. ]", inner)
-    return all(_FACTOR.fullmatch(factor) for factor in factors)
-
-
-def strip_brackets(text: str) -> str:
-    """Return a text without the brackets around it."""
-    text = text.strip()
-    return text[1:-1].strip() if text[:1] + text[-1:] in ("[]", "()", "{}", "<>") else text
-
-
-def split_unit(name: str) -> tuple[str, str]:
-    """Return the name and the unit in a text such as ``"x [m]"``, ``"x (m)"`` or ``"x_m"``.
-
-    A suffix stays in the name; the unit is empty where there is none.
-    """
-    match = re.fullmatch(r"(.*\S)\s*(\[[^\[\]]{1,12}\]|\([^()]{1,12}\))", name)
-    if match and (is_unit(match[2]) or match[2][0] == "["):
-        return match[1], strip_brackets(match[2])
-    suffix = _SUFFIX.search(name)
-    return name, suffix[1] if suffix else ""
-
-
-def normalize_time_unit(text: str) -> str:
-    """Return the key of `SECONDS` that a text stands for, or the text itself if it is no unit of time."""
-    return TIME_UNITS.get(strip_brackets(text).lower(), text)
-
-
 FloatArray = NDArray[np.float64]
-
-
-class Options(NamedTuple):
-    """The arguments of `read_log`, which readers of a format are told.
-
-    Attributes
-    ----------
-    columns, time, time_unit, topic, origin, range_error, repair
-        As of `read_log`.
-    keep_epoch : bool
-        Leave numbers that count from 1970 as they are.
-    """
-
-    columns: Sequence[str] | None = None
-    time: str | None = None
-    time_unit: str | None = None
-    topic: str | None = None
-    origin: Sequence[float] | None = None
-    range_error: float | None = None
-    repair: str | Sequence[str] = ()
-    keep_epoch: bool = False
 
 
 class Event(NamedTuple):
@@ -195,7 +122,7 @@ class Log:
         """
         if not self.offset:
             return None
-        length = 1e6 * SECONDS[self.time_unit or "s"]
+        length = 1e6 * SECONDS_OF_UNIT[self.time_unit or "s"]
         micros = round(self.offset * length) + np.rint(self.times * length).astype(np.int64)
         return Dates(micros.astype("datetime64[us]"), self.time_zone)
 
@@ -220,7 +147,9 @@ class Log:
         """Date and time of ``times == 0``, dates without a zone taken for UTC; None where the file has no dates."""
         if not self.offset:
             return None
-        return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=self.offset * SECONDS[self.time_unit or "s"])
+        return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(
+            seconds=self.offset * SECONDS_OF_UNIT[self.time_unit or "s"]
+        )
 
     def __len__(self) -> int:
         """Number of samples, K."""
@@ -315,137 +244,3 @@ class Log:
         if self.events:
             lines.append(f"  events: {len(self.events)}")
         return "\n".join([*lines, *(f"  {issue}" for issue in self.issues)])
-
-
-# --- from columns to a log --------------------------------------------------------------------------------------------
-
-_NAMES = (
-    re.compile(
-        r"_*(t|times?|timestamps?|stamp|zeit|utc|clock|date_?time|secs?|seconds|millis|micros|elapsed.*|.*[ _]elapsed)"
-    ),
-    re.compile(
-        r"_*(t_(rel|abs|[num]?s|sec|min|h)|(time|timestamp|stamp|zeit)[ _.\-/].*|.*[ _./](time|timestamp|stamp))"
-    ),
-    re.compile(r"date|datum|days?|hours?|hrs|minutes|mins"),
-)
-"""Names of columns of times: those of the first kind before those of the second."""
-
-TEMPERATURE = "T"
-"""Rather the name of a temperature; of times only if no other column has such a name, as with MATLAB's ``[T, Y]``."""
-
-
-def find_time_name(names: Iterable[str], channels: Collection[str] = ()) -> str | None:
-    """Return the name that is most clearly one of times; None if there is none.
-
-    Parameters
-    ----------
-    names : iterable of str
-    channels : collection of str
-        Names that are known to be those of measured values.
-    """
-    given = list(names)
-    for kind in _NAMES:
-        for name in given:
-            if kind.fullmatch(name.strip().lower()) and name.strip() != TEMPERATURE:
-                return name
-    return next((name for name in given if name.strip() == TEMPERATURE and name not in channels), None)
-
-
-def _find_epoch_unit(time: float) -> str | None:
-    """Return the unit in which a number is a time since 1970, None if it is too small for one."""
-    low, high = EPOCH_SECONDS
-    return next((unit for unit in ("s", "ms", "us", "ns") if low <= time * SECONDS[unit] < high), None)
-
-
-def _are_uptimes(times: FloatArray) -> bool:
-    """Return whether times that could be seconds since 1970 are rather microseconds since a start: whole, far apart."""
-    steps = np.diff(times)
-    if len(steps) == 0 or _find_epoch_unit(float(times[0])) != "s":
-        return False
-    step = float(np.median(steps))
-    return bool(np.all(times == np.rint(times)) and step >= 1000 and step % 60 != 0)
-
-
-def build_log(
-    source: str,
-    columns: Mapping[str, Any],
-    units: Mapping[str, str],
-    options: Options,
-    zones: Mapping[str, str] | None = None,
-) -> Log:
-    """Return a log from columns, one of which has the times.
-
-    Parameters
-    ----------
-    source : str
-    columns : mapping of str to (K,) array
-        Of numbers, or of ``datetime64`` where they are dates.
-    units : mapping of str to str
-        Those that are stated; others may stand in the names.
-    options : Options
-    zones : mapping of str to str, optional
-        Time zones of columns of dates, which are in UTC then.
-
-    Raises
-    ------
-    InputError
-        If there is no such column.
-    """
-    time = find_time_name(list(columns)) if options.time is None else options.time
-    if time is None:
-        refuse_without_times(source, columns)
-    if time not in columns:
-        raise InputError(f"{source} has no column {shorten(time)}; its columns are {join_names(columns)}.")
-    stated = {name: units.get(name, "") or split_unit(name)[1] for name in columns}
-    if columns[time].dtype.kind not in "biufMm":
-        raise InputError(
-            f"{source}: column {time!r} has neither numbers nor dates. Name the one with the times: time = ..."
-        )
-    times, time_unit, offset = _convert_times(columns[time], time, stated[time], options.keep_epoch)
-    values = {
-        name: np.asarray(column, dtype=np.float64)
-        for name, column in columns.items()
-        if name != time and column.dtype.kind in "biuf"
-    }
-    labels = {name: split_unit(name)[0] for name in values}
-    return Log(
-        times=times,
-        values=values,
-        units={name: stated[name] for name in values},
-        time_unit=time_unit,
-        source=source,
-        offset=offset,
-        labels={short: name for name, short in labels.items() if short not in values},
-        rows=np.arange(1, len(times) + 1),
-        time_name=time,
-        time_zone=(zones or {}).get(time, "") if columns[time].dtype.kind == "M" else "UTC",
-        has_dates=columns[time].dtype.kind == "M",
-    )
-
-
-def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple[FloatArray, str, float]:
-    """Return times, their unit, and what was subtracted from them: the first one, if they count from 1970.
-
-    Integers are subtracted as such; doubles would round them. With `keep_epoch` numbers are left as they are.
-    """
-    second = np.timedelta64(1, "s")
-    if column.dtype.kind == "M":
-        first = column[~np.isnat(column)][0]
-        micros = first.astype("datetime64[us]").astype(np.int64)
-        return (column - first) / second, "s", float(micros) / 1e6
-    if column.dtype.kind == "m":
-        return column / second, "s", 0.0
-    numbers = np.asarray(column, dtype=np.float64)
-    unit = normalize_time_unit(unit)
-    if unit not in SECONDS:  # it may be a word in the name, such as in seconds_elapsed or millis
-        words = re.split(r"[ _.\-/]", name.lower())
-        unit = next((TIME_UNITS[word] for word in words if len(word) > 3 and word in TIME_UNITS), "")
-    finite = numbers[np.isfinite(numbers)]
-    epoch = _find_epoch_unit(float(finite[0])) if len(finite) else None
-    if epoch is None or (unit and unit != epoch) or (not unit and _are_uptimes(finite)):
-        return numbers, unit, 0.0
-    if keep_epoch:
-        return numbers, epoch, 0.0
-    if column.dtype.kind in "iu":
-        return (column.astype(np.int64) - int(column[0])).astype(np.float64), epoch, float(column[0])
-    return numbers - finite[0], epoch, float(finite[0])

@@ -9,21 +9,38 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs import explain_damage
-from switchfit.io.logs.log import Event, Log, Options, build_log
-from switchfit.io.logs.reader import LOCAL, SIGMA
-from switchfit.problem.validation import shorten
-from switchfit.runtime.errors import InputError, Issue, import_library
+from switchfit.io.logs.columns import build_log
+from switchfit.io.logs.local_frame import LOCAL_CHANNELS, SIGMA_CHANNELS
+from switchfit.io.logs.log import Event, Log
+from switchfit.io.logs.options import Options
+from switchfit.io.logs.refusals import explain_damage
+from switchfit.problem.validation.messages import shorten
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.extras import import_library
+from switchfit.runtime.issue import Issue
 
 SECOND = 10**9
 """Nanoseconds."""
-FAR = 86_400 * SECOND
+
+LARGEST_CLOCK_DIFFERENCE = 86_400 * SECOND
 """By how much stamps of headers may differ from the clock of the recorder; beyond, they are of another clock, as that
 of a simulation, and stay as they are."""
+
 LONGEST_ARRAY = 36
 """Entries of an array in a message that become channels; longer ones are pictures and scans."""
 
 Record = dict[str, float]
+_POSE = ("x", "y", "z", "", "", "yaw")
+
+_TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
+"""Channels of the diagonal of a covariance."""
+
+_UNITS = {"latitude": "deg", "longitude": "deg", "altitude": "m", "yaw": "rad"}
+_UNITS |= {"position": "rad", "velocity": "rad/s", "effort": "N m"} | dict.fromkeys(
+    ("x", "y", "z", *LOCAL_CHANNELS), "m"
+)
+_UNITS |= {f"{s}{axis}": unit for axis in "xyz" for s, unit in (("v", "m/s"), ("w", "rad/s"), ("a", "m/s^2"))}
+"""Of the channels of known types of messages."""
 
 
 def read_bag(path: Path, options: Options) -> Log:
@@ -68,7 +85,9 @@ def _read_topic(path: Path, reader: Any, options: Options) -> Log:
     received, stamps, records, events = zip(*found, strict=True)
     has_stamps = any(stamps)
     moments = np.array(stamps if has_stamps else received)
-    zero = start if abs(int(moments[0]) - start) < FAR else 0  # all topics of a bag count from its begin
+    zero = (
+        start if abs(int(moments[0]) - start) < LARGEST_CLOCK_DIFFERENCE else 0
+    )  # all topics of a bag count from its begin
     names = dict.fromkeys(name for record in records for name in record)
     values = {name: np.array([record.get(name, np.nan) for record in records], dtype=np.float64) for name in names}
     quantities = {name: name.rpartition(".")[2].removeprefix("sigma_") for name in values}
@@ -114,7 +133,7 @@ def _read_fix(message: Any) -> Record:
     found = {name: getattr(message, name) for name in position}
     variances = np.asarray(message.position_covariance)[[0, 4, 8]]
     if message.position_covariance_type > 0 and np.all(variances > 0):
-        found |= dict(zip(SIGMA, np.sqrt(variances).tolist(), strict=True))
+        found |= dict(zip(SIGMA_CHANNELS, np.sqrt(variances).tolist(), strict=True))
     return found
 
 
@@ -170,15 +189,6 @@ def _flatten(message: Any, prefix: str = "") -> Record:
             found |= _flatten(value, f"{prefix}{name}.")
     return found
 
-
-_POSE = ("x", "y", "z", "", "", "yaw")
-_TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
-"""Channels of the diagonal of a covariance."""
-
-_UNITS = {"latitude": "deg", "longitude": "deg", "altitude": "m", "yaw": "rad"}
-_UNITS |= {"position": "rad", "velocity": "rad/s", "effort": "N m"} | dict.fromkeys(("x", "y", "z", *LOCAL), "m")
-_UNITS |= {f"{s}{axis}": unit for axis in "xyz" for s, unit in (("v", "m/s"), ("w", "rad/s"), ("a", "m/s^2"))}
-"""Of the channels of known types of messages."""
 
 _READERS: dict[str, Callable[[Any], Record]] = {
     "sensor_msgs/msg/NavSatFix": _read_fix,

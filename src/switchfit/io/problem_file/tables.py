@@ -3,6 +3,8 @@
 The text below a field describes it in error messages and in the tables of ``docs/problem-file.md``.
 """
 
+from __future__ import annotations
+
 import ast
 import datetime
 import inspect
@@ -19,14 +21,34 @@ OPTIONS = {"strategy", "time_budget", "hessian", "tolerance", "max_iterations"}
 
 HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
 
+ENTRY = BeforeValidator(lambda given: given if isinstance(given, list) else [given])
+"""A list; a single entry becomes a list of one."""
 
-class Table(pydantic.BaseModel):
+Other = TypeVar("Other")
+Entries = TypeVar("Entries")
+
+OrTable = Annotated[
+    Annotated[Other, Tag("other")] | Annotated[dict[str, Entries], Tag("table")],
+    pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "other"),
+]
+"""Something, or a table with entries; errors are about what is given, and not about either."""
+
+Positive = Annotated[float, Field(gt=0)]
+Duration = Annotated[float, Field(ge=0)]
+Names = Annotated[list[str], Field(min_length=1)]
+NameOrNames = Annotated[list[str], ENTRY]
+
+MinDuration = OrTable[Duration, Duration]
+"""One for all modes, or one for each; 0 for those that are left out."""
+
+
+class TomlTable(pydantic.BaseModel):
     """A table of a problem file, without other keys than its fields."""
 
     model_config = pydantic.ConfigDict(extra="forbid", strict=True, frozen=True, defer_build=True)
 
 
-def describe_keys(kind: type[Table]) -> dict[str, str]:
+def describe_keys(kind: type[TomlTable]) -> dict[str, str]:
     """Return the text below each key of a table, in one line.
 
     It is read from the source when it is needed. pydantic would read it for all tables when they are defined
@@ -37,7 +59,7 @@ def describe_keys(kind: type[Table]) -> dict[str, str]:
     kind : type
     """
     found: dict[str, str] = {}
-    for each in reversed(kind.__mro__[: kind.__mro__.index(Table)]):
+    for each in reversed(kind.__mro__[: kind.__mro__.index(TomlTable)]):
         (definition,) = ast.parse(inspect.getsource(each)).body
         for key, text in pairwise(ast.iter_child_nodes(definition)):
             if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr):
@@ -66,7 +88,7 @@ def _check_time(given: Any) -> Any:
         return float(given)
     if is_date(given):
         return given
-    from switchfit.problem.dates import EXAMPLES
+    from switchfit.problem.dates import DATE_EXAMPLES as EXAMPLES
 
     raise PydanticCustomError("time_type", f"Input should be a number or a date such as {EXAMPLES}")
 
@@ -79,36 +101,20 @@ def _wrap(key: str, **more: Any) -> BeforeValidator:
 GUESS = _wrap("value")
 """``0.8``, the guess of an unknown, becomes ``{ value = 0.8 }``."""
 
-KNOWN = _wrap("value", fixed=True)
+
+KNOWN_VALUE = _wrap("value", fixed=True)
 """``0.5``, a state at t0 or tf, becomes ``{ value = 0.5, fixed = true }``."""
 
-NAMED = _wrap("name")
+
+NAMED_OBJECT = _wrap("name")
 """``"skid_steer"``, a model without arguments, becomes ``{ name = "skid_steer" }``."""
 
-ENTRY = BeforeValidator(lambda given: given if isinstance(given, list) else [given])
-"""A list; a single entry becomes a list of one."""
-
-Other = TypeVar("Other")
-Entries = TypeVar("Entries")
-OrTable = Annotated[
-    Annotated[Other, Tag("other")] | Annotated[dict[str, Entries], Tag("table")],
-    pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "other"),
-]
-"""Something, or a table with entries; errors are about what is given, and not about either."""
 
 Time = Annotated[Any, pydantic.PlainValidator(_check_time)]
 """A number in the experiment's time unit, or a date."""
 
-Positive = Annotated[float, Field(gt=0)]
-Duration = Annotated[float, Field(ge=0)]
-Names = Annotated[list[str], Field(min_length=1)]
-NameOrNames = Annotated[list[str], ENTRY]
 
-MinDuration = OrTable[Duration, Duration]
-"""One for all modes, or one for each; 0 for those that are left out."""
-
-
-class PriorTable(Table):
+class PriorTable(TomlTable):
     """A prior: normal with mean and sd, or log-normal with median and log_sd."""
 
     mean: Time = None
@@ -121,7 +127,7 @@ class PriorTable(Table):
     """standard deviation of the logarithm, for a log-normal prior"""
 
 
-class ParameterTable(Table):
+class ParameterTable(TomlTable):
     """A guess with bounds, unit and prior; a bare number is a guess without bounds."""
 
     value: float | list[float]
@@ -160,7 +166,7 @@ class StateTable(ParameterTable):
     """unit, for the report; left out, that of the state"""
 
 
-class LogTable(Table):
+class LogTable(TomlTable):
     """Channels of a log over time."""
 
     file: str | None = None
@@ -222,7 +228,7 @@ class InputTable(LogTable):
     """interpolation between samples"""
 
 
-class ModelTable(Table):
+class ModelTable(TomlTable):
     """The model: built in, or in a Python file."""
 
     name: str
@@ -231,17 +237,17 @@ class ModelTable(Table):
     """arguments of the function"""
 
 
-class JumpTable(Table):
+class JumpTable(TomlTable):
     """A change of the state at known times."""
 
     time: Annotated[list[Time], ENTRY]
     """when, in the experiment's time_unit or as a date: one time, or several"""
-    map: Annotated[ModelTable, NAMED]
+    map: Annotated[ModelTable, NAMED_OBJECT]
     """'file.py:function' with map(t, x, p), which returns the state just after; or a table with the name and arguments
     of a function that returns such a map"""
 
 
-class ExperimentTable(Table):
+class ExperimentTable(TomlTable):
     """One run."""
 
     mode_sequence: Names | None = None
@@ -260,10 +266,10 @@ class ExperimentTable(Table):
     """data to which the model is fitted; the costs of several tables are added"""
     t0: Time = None
     """start of the horizon, a number or a date; left out, the first sample"""
-    tf: Annotated[TransitionTable, KNOWN] | None = None
+    tf: Annotated[TransitionTable, KNOWN_VALUE] | None = None
     """end of the horizon; left out, the last sample. A number or a date, or a table with value, lower and upper if it
     is to be estimated"""
-    initial_state: list[Annotated[StateTable, KNOWN]] | None = None
+    initial_state: list[Annotated[StateTable, KNOWN_VALUE]] | None = None
     """state at t0, instead of the model's: a number, or a table if it is to be estimated"""
     parameter_map: dict[str, str] = {}
     """the model's name of a parameter = the name under [parameters] that this run uses for it"""
@@ -280,7 +286,7 @@ class ExperimentTable(Table):
         return logs if self.inputs is None else logs | {"inputs": self.inputs}
 
 
-class LibraryTable(Table):
+class LibraryTable(TomlTable):
     """The mode sequences among which ``switchfit modes`` searches."""
 
     modes: Names | None = Field(default=None, serialization_alias="library")
@@ -295,7 +301,7 @@ class LibraryTable(Table):
     """mode = the modes that may follow it; a mode that is left out is the last; left out, any may follow any"""
 
 
-class OnlineTable(Table):
+class OnlineTable(TomlTable):
     """How ``switchfit online`` follows the samples, where its options leave it open."""
 
     window: Positive | None = None
@@ -306,7 +312,7 @@ class OnlineTable(Table):
     """parameter = the standard deviation of its random walk after one time_unit; it needs a window"""
 
 
-class DesignTable(Table):
+class DesignTable(TomlTable):
     """What ``switchfit design`` may choose of the last run."""
 
     free: dict[str, Annotated[list[float | list[float]], Field(min_length=2, max_length=2)]] | None = None
@@ -326,7 +332,7 @@ class DesignTable(Table):
     """inputs at random from which the search begins; left out, 8"""
 
 
-class OptionsTable(Table):
+class OptionsTable(TomlTable):
     """Options of the fit; options that are left out have the library's defaults."""
 
     min_duration: MinDuration | None = None
@@ -350,12 +356,12 @@ class OptionsTable(Table):
     """most iterations"""
 
 
-class Contents(Table):
+class Contents(TomlTable):
     """The whole file: a model with parameters and experiments, or a problem built in Python."""
 
-    model: Annotated[ModelTable, NAMED] | None = None
+    model: Annotated[ModelTable, NAMED_OBJECT] | None = None
     """a built-in model, or 'file.py:object', or a table with name and arguments"""
-    problem: Annotated[ModelTable, NAMED] | None = None
+    problem: Annotated[ModelTable, NAMED_OBJECT] | None = None
     """'file.py:object' with an sf.Problem or a function making one, instead of all the rest"""
     parameters: dict[str, Annotated[ParameterTable, GUESS]] = {}
     """the model's parameters"""

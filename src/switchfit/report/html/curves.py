@@ -1,13 +1,7 @@
-"""What the figures of one run show, thinned to what can be seen, with its derivatives in the unknowns that move it.
+"""The curves and samples of one run in a page, thinned to what can be seen, with derivatives in the unknowns.
 
-It is in columns by the names that the page's script puts into the sources of the figures. The script keeps what sliders
-move (t, y0.., x, left, right) as fit_t, fit_y0.. as well. Tangents and bands are float32.
-
-Sliders: how far an unknown may be moved, and the exact J on the way.
-
-The curves move by their derivatives, ``x(t; theta + d) ~ x + S d``. J along one unknown, the others held, is
-evaluated, and shows beside its quadratic approximation how far derivatives hold; where several are moved, J is that
-approximation, ``J + g d + d' H d / 2``.
+They are in columns by the names that the page's script puts into the sources of the figures. The script keeps what
+sliders move (t, y0.., x, left, right) as fit_t, fit_y0.. as well. Tangents and bands are float32.
 """
 
 from __future__ import annotations
@@ -23,20 +17,24 @@ from numpy.typing import NDArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, find_delay
-from switchfit.problem.data import FloatArray
-from switchfit.report.formats import describe_clock, format_estimate, format_unit, get_unit, list_dated
-from switchfit.report.plot import find_plane, has_bands, replace_infinities
-from switchfit.report.text import format_end
+from switchfit.problem.validation.arrays import FloatArray
+from switchfit.report.fit_figure import has_bands
+from switchfit.report.numbers import format_unit, get_unit
+from switchfit.report.panels import replace_infinities
+from switchfit.report.plane import find_plane
+from switchfit.report.times import format_estimate
+from switchfit.report.unknowns import format_end
 from switchfit.uncertainty.prediction import Points, predict
 from switchfit.uncertainty.residuals import correct_errors, find_transition_intervals
 
-MOST_POINTS, FEWEST_POINTS = 800, 80
+MOST_POINTS_OF_CURVE, FEWEST_POINTS_OF_CURVE = 800, 80
 """Points of one curve: with more of them a figure looks the same."""
-MOST_SAMPLES = 2000
+
+MOST_DRAWN_SAMPLES = 2000
 """Samples of one channel that are drawn."""
+
 BUDGET = 300_000
 """Numbers that the curves of all runs may have together, with their derivatives: 1.6 MB in the page."""
-
 
 Columns = Mapping[str, Any]
 """Numbers by the names that they have in the page."""
@@ -98,7 +96,7 @@ def choose_points(estimate: Estimate, runs: Sequence[int], unknowns: int) -> int
     """
     states = sum(estimate.trajectories[e].states.shape[1] for e in runs)
     channels = states + sum(len(comparison.names) for e in runs for comparison in estimate.comparisons[e])
-    return int(np.clip(BUDGET / max(channels * (unknowns + 4), 1), FEWEST_POINTS, MOST_POINTS))
+    return int(np.clip(BUDGET / max(channels * (unknowns + 4), 1), FEWEST_POINTS_OF_CURVE, MOST_POINTS_OF_CURVE))
 
 
 def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: int) -> list[Curves]:
@@ -146,7 +144,7 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
         columns = range(first, first := first + len(names))
         late = find_delay(comparison, trajectory)
         count = len(comparison.times)
-        drawn = np.arange(0, count, max(-(-count // MOST_SAMPLES), 1))
+        drawn = np.arange(0, count, max(-(-count // MOST_DRAWN_SAMPLES), 1))
         curve = list_curve(columns, late)
         if find_plane(names, units) is not None:
             curve["size"] = np.where(np.roll(kept < 0, 1), 13.0, 0.0).astype("f4")
@@ -241,93 +239,3 @@ def list_transitions(fit: Fit, e: int) -> Columns:
     words: dict[str, Any] = {"name": [t.name for t in own], "modes": [f"{t.before} → {t.after}" for t in own]}
     words |= {"value": values, "interval": shown}
     return {**numbers, **words, "place": [-1 if t.index is None else t.index for t in own]}
-
-
-SIDE_POINTS = 20
-"""Values of J to each side of the estimate."""
-VISIBLE = 0.15
-"""Part of a channel's range by which the end of a slider moves the curve, if the bounds allow it."""
-
-
-def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[dict[str, Any]]:
-    """Return what the page knows of a slider, for each unknown that has room to move.
-
-    Its place in theta, its name, unit and value, how it is shown as a date, the `values` and J along it, the others
-    held, None where it cannot be evaluated.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        With its problem.
-    runs : mapping of run to its curves
-        Those that are shown.
-    places : sequence of int
-        The unknowns.
-    """
-    found = []
-    for place in places:
-        (low, high), theta = find_range(estimate, runs, place), float(estimate.theta[place])
-        if not low < high:
-            continue
-        sides = np.linspace(low, theta, SIDE_POINTS + 1), np.linspace(theta, high, SIDE_POINTS + 1)
-        values = np.unique(np.concatenate(sides))
-        costs = np.array([evaluate_moved(estimate, place, value) for value in values])
-        run = list_dated(estimate)[place]
-        slider = {"place": place, "name": estimate.theta_names[place], "theta": theta}
-        slider |= {"clock": run and describe_clock(run), "unit": format_unit(estimate.theta_units[place])}
-        found.append({**slider, "values": drop_nan(values), "costs": drop_nan(costs)})
-    return found
-
-
-def drop_nan(values: Any) -> Any:
-    """Return a number or an array for JSON, with None for what is not finite."""
-    return np.where(np.isfinite(values), values, np.array(None)).tolist()
-
-
-def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) -> tuple[float, float]:
-    """Return how far an unknown can be moved: until a curve has moved visibly, inside its bounds, in its order.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    runs : mapping of run to its curves
-    place : int
-    """
-    theta = float(estimate.theta[place])
-    wanted = []
-    for own in (own for run in runs.values() for own in run if f"d{place}_0" in own.curve):
-        for k in range(len(own.names)):
-            known = own.curve[f"y{k}"][np.isfinite(own.curve[f"y{k}"])]
-            slope = float(np.nanmax(np.abs(own.curve[f"d{place}_{k}"]), initial=0.0))
-            if len(known) and np.ptp(known) > 0 and slope > 0:
-                wanted.append(VISIBLE * float(np.ptp(known)) / slope)
-    half = min(wanted, default=0.0) or 0.1 * abs(theta) or 1.0
-    constraints = estimate.evaluator_at_solution().problem.constraints
-    slopes, slack = constraints.A[:, place], constraints.A @ estimate.theta - constraints.b
-    room = 0.98 * np.divide(slack, np.abs(slopes), out=np.full_like(slack, np.inf), where=slopes != 0)
-    low = max(theta - np.min(room[slopes > 0], initial=half), float(estimate.lower[place]))
-    high = min(theta + np.min(room[slopes < 0], initial=half), float(estimate.upper[place]))
-    return low, high
-
-
-def evaluate_moved(estimate: Estimate, place: int, value: float) -> float:
-    """Return J with one unknown moved, by evaluating the runs that depend on it.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    place : int
-    value : float
-    """
-    evaluator = estimate.evaluator_at_solution()
-    problem = evaluator.problem
-    moved = estimate.theta.copy()
-    moved[place] = value
-    runs = [e for e, places in enumerate(problem.places) if place in places]
-
-    def add_up(theta: FloatArray) -> float:
-        costs = [evaluator.engines[e].cost(*problem.vectors(theta, e)) for e in runs]
-        return sum(costs) + float(problem.unknowns.priors.evaluate(theta)[0])
-
-    total = estimate.cost + add_up(moved) - add_up(estimate.theta)
-    return float(total) if np.isfinite(total) else np.nan

@@ -1,0 +1,73 @@
+"""Compile and cache programs: a library of modes is compiled once a process, or has a reason why it cannot be.
+
+Functions that cannot be written as straight-line code have no machine code. Any other failure is a defect of this
+package: the caller falls back to JAX as well, and the reason begins with "internal: ".
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from itertools import chain
+
+from switchfit.engine.native.layout import layout_of
+from switchfit.engine.native.llvm.compilation import Program, compile_modules
+from switchfit.engine.native.llvm.module import Module
+from switchfit.engine.native.sizes import Order, Sizes
+from switchfit.engine.native.tracing.unsupported import Unsupported
+from switchfit.problem.functions import use_float64
+from switchfit.problem.structure import Structure
+from switchfit.runtime.work_clock import stop_clock
+
+_one_at_a_time = threading.Lock()
+log = logging.getLogger("switchfit")
+
+ORDER_PREFIXES = {
+    Order.COST: "plain_",
+    Order.GRADIENT: "first_",
+    Order.HESSIAN: "",
+    Order.GAUSS_NEWTON: "gauss_newton_",
+}
+"""Prefix of the names of functions, by the order of their derivatives."""
+
+Write = Callable[[Structure, Sizes, Order, Module], Iterator[str]]
+"""Writes functions of a library with derivatives of an order, in parts."""
+
+
+def compile_library(library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write) -> Program | str:
+    """Return the machine code that a function writes, or the reason why there is none, as `program_of` does.
+
+    The log has the reason too.
+    """
+    with _one_at_a_time, stop_clock():
+        return _program_of(library, sizes, orders, write)
+
+
+@lru_cache(maxsize=64)
+def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write) -> Program | str:
+    modules = {order: Module(sizes.width, ORDER_PREFIXES[order]) for order in orders}
+    try:
+        if sizes.D == 0:
+            raise Unsupported("an experiment has no unknowns")
+        with use_float64():
+            parts = (write(library, sizes, order, each) for order, each in modules.items())
+            program = compile_modules(chain.from_iterable(parts))
+    except Unsupported as error:
+        reason = str(error)
+        log.info("No machine code: %s.", reason)
+    except Exception as error:
+        reason = f"internal: {type(error).__name__}: {error}"
+        log.info("No machine code: %s.", reason, exc_info=True)
+    else:
+        program.modules = modules
+        return program
+    return reason
+
+
+def drop_programs() -> None:
+    """Drop cached programs that are not in use, and what is known of their memory."""
+    with _one_at_a_time:
+        _program_of.cache_clear()
+        layout_of.cache_clear()

@@ -1,0 +1,153 @@
+"""Entries of traced arrays, and selections among them at run time.
+
+An entry is a Python number, a node (a double, or a truth value in an array of booleans), or an `Integer`: one that
+depends on the state, as a double with bounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from switchfit.engine.native.scalars.graph import Graph, Node
+from switchfit.engine.native.tracing.unsupported import check_size
+
+MOST_CHOICES = 64
+"""Largest number of state-dependent entries from which an index selects: each takes a comparison and a selection."""
+
+MOST_SELECTIONS = 4
+"""Largest number of known entries from which an index selects by comparisons; more become a table in memory."""
+
+MOST_ROWS_OF_TABLE = 100_000
+"""Largest number of entries of a table in memory. It is part of the module's text: 2 MB at this size."""
+
+
+@dataclass(frozen=True, slots=True)
+class Integer:
+    """An integer that depends on the state.
+
+    Attributes
+    ----------
+    node : Node
+        Its value, as a double; it is finite, and never -0.0.
+    low, high : int
+        Inclusive bounds of its value, far below 2**53, so that arithmetic with doubles is exact.
+    """
+
+    node: Node
+    low: int
+    high: int
+
+    @classmethod
+    def of(cls, graph: Graph, value: Any) -> Integer:
+        """Convert a known integer or a truth value to an `Integer`; return an `Integer` as it is."""
+        if isinstance(value, Integer):
+            return value
+        if isinstance(value, Node):
+            return cls(graph.apply("select", value, 1.0, 0.0), 0, 1)
+        return cls(graph.constant(float(value)), int(value), int(value))
+
+
+def _is_known_integer(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def choose(graph: Graph, condition: Any, yes: Any, no: Any) -> Any:
+    """Select one of two entries of the same type; the condition may be known or traced."""
+    known = known_number(condition)
+    if known is not None:
+        return yes if known else no
+    if isinstance(yes, Integer) or isinstance(no, Integer) or (_is_known_integer(yes) and _is_known_integer(no)):
+        one, other = Integer.of(graph, yes), Integer.of(graph, no)
+        node = graph.apply("select", condition, one.node, other.node)
+        return Integer(node, min(one.low, other.low), max(one.high, other.high))
+    return graph.apply("select", condition, yes, no)
+
+
+def less(graph: Graph, a: Any, b: Any) -> Any:
+    """Return whether a < b for integers: a bool if their bounds decide it."""
+    one, other = Integer.of(graph, a), Integer.of(graph, b)
+    if one.high < other.low:
+        return True
+    if one.low >= other.high:
+        return False
+    return graph.apply("lt", one.node, other.node)
+
+
+def equal(graph: Graph, a: Any, b: Any) -> Any:
+    """Return whether a == b for integers: a bool if their bounds decide it."""
+    one, other = Integer.of(graph, a), Integer.of(graph, b)
+    if one.high < other.low or other.high < one.low:
+        return False
+    if one.node is other.node or one.low == one.high == other.low == other.high:
+        return True
+    return graph.apply("eq", one.node, other.node)
+
+
+def clamp(graph: Graph, index: Any, low: int, high: int) -> Any:
+    """Clamp an integer to a range; return an int if the result is known."""
+    if not isinstance(index, Integer):
+        return min(max(int(index), low), high)
+    found = choose_extreme(graph, min, high, choose_extreme(graph, max, low, index))
+    return found.low if found.low == found.high else found
+
+
+def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
+    """Select an entry by an index; the first entry belongs to `index.low`, the last one to `index.high`.
+
+    Equal neighbors are merged, so that one number in a row of zeros takes two selections. More than a few known numbers
+    become a table in memory, whose lookup takes the same time for any size.
+    """
+    starts = [k for k in range(len(entries)) if k == 0 or not _is_same(entries[k - 1], entries[k])]
+    if len(starts) == 1:
+        return entries[0]
+    if len(starts) > MOST_SELECTIONS and all(known_number(e) is not None for e in entries):
+        return _look_up(graph, list(map(known_number, entries)), index)
+    count = len(starts)
+    check_size(count, MOST_CHOICES, f"takes one of {count} numbers by an index that depends on the state")
+
+    def select_run(runs: list[int]) -> Any:
+        if len(runs) == 1:
+            return entries[runs[0]]
+        middle = len(runs) // 2
+        before = less(graph, index, index.low + runs[middle])
+        return choose(graph, before, select_run(runs[:middle]), select_run(runs[middle:]))
+
+    return select_run(starts)
+
+
+def known_number(entry: Any) -> Any:
+    """Return the value of an entry; None if it depends on the state."""
+    if isinstance(entry, Node):
+        return entry.number
+    return None if isinstance(entry, Integer) else entry
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    if isinstance(one, Integer) and isinstance(other, Integer):
+        return one.node is other.node
+    a, b = known_number(one), known_number(other)
+    if a is None or b is None:
+        return one is other
+    return bool((a == b and np.signbit(a) == np.signbit(b)) or (a != a and b != b))
+
+
+def _look_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
+    check_size(len(entries), MOST_ROWS_OF_TABLE, f"looks up numbers in a table of {len(entries)} entries")
+    node = graph.lookup(np.array(entries, dtype=float), index.node - float(index.low))
+    if all(isinstance(e, bool | np.bool_) for e in entries):
+        return graph.apply("ne", node, 0.0)
+    if all(_is_known_integer(e) for e in entries):
+        return Integer(node, int(min(entries)), int(max(entries)))
+    return node
+
+
+def choose_extreme(graph: Graph, extreme: Callable[..., int], a: Any, b: Any) -> Integer:
+    """Return the smaller (larger) of two integers, as Python's `min` (`max`) does for bounds."""
+    one, other = Integer.of(graph, a), Integer.of(graph, b)
+    is_first = less(graph, one, other) if extreme is min else less(graph, other, one)
+    node = choose(graph, is_first, one, other).node
+    return Integer(node, extreme(one.low, other.low), extreme(one.high, other.high))

@@ -1,0 +1,172 @@
+"""Gather, scatter and slices of traced arrays, at indices that may depend on the state.
+
+They are unrolled: selections choose the entry at run time. Indices out of range are treated as in JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+from jax.lax import GatherScatterMode
+
+from switchfit.engine.native.scalars.graph import Graph, Objects
+from switchfit.engine.native.tracing.entries import (
+    MOST_CHOICES,
+    Integer,
+    choose,
+    clamp,
+    equal,
+    known_number,
+    less,
+    pick,
+)
+from switchfit.engine.native.tracing.integers import OF_INTEGERS
+from switchfit.engine.native.tracing.unsupported import check_size
+
+# Windows at indices
+
+
+Combine = Callable[[Any, Any, Any], Any]
+"""(condition, old entry, update) -> new entry."""
+
+
+def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> Any:
+    """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
+    moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
+    # What the window may reach along each axis.
+    ends = [(s.low, s.high) if isinstance(s, Integer) else (s, s) for s in starts]
+    a = a[tuple(slice(low, high + size) for (low, high), size in zip(ends, sizes, strict=True))]
+    if len(moving) > 1 and all(known_number(e) is not None for e in a.reshape(-1)):
+        return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
+    for axis in moving:
+        rows = np.moveaxis(a, axis, 0)
+        window = np.empty((sizes[axis], *rows.shape[1:]), dtype=object)
+        for place in np.ndindex(*window.shape):
+            candidates = rows[(slice(place[0], place[0] + len(rows) - sizes[axis] + 1), *place[1:])]
+            window[place] = pick(graph, candidates.tolist(), starts[axis])
+        a = np.moveaxis(window, 0, axis)
+    return a
+
+
+def _from_table(graph: Graph, a: Any, starts: list[Integer], moving: list[int], sizes: Sequence[int]) -> Objects:
+    """Take a window of a known array that moves along several axes: each entry by one index into a table."""
+    multiply, add, subtract = (partial(OF_INTEGERS[op], graph, {}, np.dtype(int)) for op in ("mul", "add", "sub"))
+    spans = [start.high - start.low + 1 for start in starts]
+    index: Any = 0
+    for start, span in zip(starts, spans, strict=True):
+        index = add(multiply(index, span), subtract(start, start.low))
+    index = Integer(index.node, 0, int(np.prod(spans)) - 1)
+    window = np.empty(sizes, dtype=object)
+    for place in np.ndindex(*sizes):
+        reached = tuple(
+            slice(place[k], place[k] + spans[moving.index(k)]) if k in moving else place[k] for k in range(a.ndim)
+        )
+        window[place] = pick(graph, a[reached].reshape(-1).tolist(), index)
+    return window
+
+
+def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: Combine, condition: Any = True) -> None:
+    """Change a window of an array of objects in place, at starts that are in range where the condition holds."""
+    ranges = [range(s.low, s.high + 1) if isinstance(s, Integer) else (s,) for s in starts]
+    count = int(np.prod([len(r) for r in ranges]))
+    check_size(count, MOST_CHOICES, f"changes one of {count} numbers at an index that depends on the state")
+    for first in product(*ranges):
+        here = condition
+        for start, value in zip(starts, first, strict=True):
+            here = graph.apply("and", here, equal(graph, start, value))
+        if known_number(here) is False:
+            continue
+        for place in np.ndindex(*window.shape):
+            at = tuple(f + k for f, k in zip(first, place, strict=True))
+            a[at] = combine(here, a[at], window[place])
+
+
+def dynamic_slice(graph: Graph, equation: Any, a: Any, *starts: Any) -> Any:
+    """Trace `jax.lax.dynamic_slice`: a window that is out of range is moved inside."""
+    sizes = equation.params["slice_sizes"]
+    return take(graph, a, _move_inside(graph, starts, a.shape, sizes), sizes)
+
+
+def dynamic_update_slice(graph: Graph, equation: Any, a: Any, update: Any, *starts: Any) -> Any:
+    """Trace `jax.lax.dynamic_update_slice`."""
+    result = a.astype(object)
+    inside = _move_inside(graph, starts, a.shape, update.shape)
+    put(graph, result, inside, update, lambda here, old, new: choose(graph, here, new, old))
+    return result
+
+
+def _move_inside(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequence[int]) -> list[Any]:
+    return [clamp(graph, s.item(), 0, n - size) for s, n, size in zip(starts, shape, sizes, strict=True)]
+
+
+def _list_windows(
+    graph: Graph, shape: Sequence[int], indices: Any, sizes: Sequence[int], numbers: Any, inside: Any, many: int
+) -> Iterator[tuple[list[Any], Any, tuple[Any, ...]]]:
+    """Yield the windows that a gather or a scatter moves.
+
+    `inside` are the axes inside windows among the `many` axes of the array of all windows. Of each window: the first
+    index along each axis of the operand, moved into range; whether the window was in range; its index in the array of
+    all windows.
+    """
+    gathers = hasattr(numbers, "start_index_map")
+    axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
+    own = numbers.start_indices_batching_dims if gathers else numbers.scatter_indices_batching_dims
+    batched = dict(zip(numbers.operand_batching_dims, own, strict=True))
+    outside = [k for k in range(many) if k not in inside]
+    for place in np.ndindex(*indices.shape[:-1]):
+        starts: list[Any] = [place[batched[axis]] if axis in batched else 0 for axis in range(len(shape))]
+        for axis, start in zip(axes, indices[place], strict=True):
+            starts[axis] = start
+        fits: Any = True
+        for axis, (start, n, size) in enumerate(zip(starts, shape, sizes, strict=True)):
+            for outside_range in (less(graph, start, 0), less(graph, n - size, start)):
+                fits = graph.apply("and", fits, graph.apply("not", outside_range))
+            starts[axis] = clamp(graph, start, 0, n - size)
+        among: list[Any] = [slice(None)] * many
+        for axis, k in zip(outside, place, strict=True):
+            among[axis] = k
+        yield starts, fits, tuple(among)
+
+
+def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
+    """Trace `jax.lax.gather`."""
+    params, out = equation.params, equation.outvars[0].aval
+    numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
+    dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    result = np.empty(out.shape, dtype=object)
+    windows = _list_windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape))
+    for starts, fits, among in windows:
+        taken = np.squeeze(take(graph, a, starts, sizes), axis=dropped)
+        if params["mode"] == GatherScatterMode.FILL_OR_DROP and known_number(fits) is not True:
+            fill = _fill_value(params["fill_value"], out.dtype)
+            filled = np.frompyfunc(partial(choose, graph, fits), 2, 1)(taken, fill)
+            taken = np.asarray(filled, dtype=object)
+        result[among] = taken if taken.ndim else taken.item()
+    return result
+
+
+def _fill_value(given: Any, dtype: np.dtype[Any]) -> Any:
+    """Return JAX's value for an index out of range: NaN, True, or the largest unsigned or smallest signed integer."""
+    if given is not None:
+        return np.asarray(given, dtype).item()
+    if dtype.kind in "iu":
+        return int(np.iinfo(dtype).max if dtype.kind == "u" else np.iinfo(dtype).min)
+    return True if dtype.kind == "b" else float("nan")
+
+
+def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, combine: Combine) -> Any:
+    """Trace `jax.lax.scatter`, `scatter_add` and their variants."""
+    params = equation.params
+    numbers = params["dimension_numbers"]
+    inside, dropped = numbers.update_window_dims, (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
+    lengths = iter([updates.shape[k] for k in inside])
+    sizes = [1 if k in dropped else next(lengths) for k in range(a.ndim)]
+    result = a.astype(object)
+    for starts, fits, among in _list_windows(graph, a.shape, indices, sizes, numbers, inside, updates.ndim):
+        update = np.asarray(updates[among], dtype=object).reshape(sizes)
+        put(graph, result, starts, update, combine, True if params["mode"] == GatherScatterMode.CLIP else fits)
+    return result

@@ -1,0 +1,46 @@
+"""Values, names and units as short text for messages."""
+
+from __future__ import annotations
+
+import reprlib
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from switchfit.runtime.presentation import join_first
+
+LONGEST_SHOWN_VALUE = 120
+"""Largest number of characters of a value that a message shows."""
+
+MOST_LISTED = 10
+"""Largest number of names that a message lists."""
+
+# --- what messages show -----------------------------------------------------------------------------------------------
+
+
+_SHORT = reprlib.Repr()
+"""Representations of bounded length, computed in bounded time."""
+
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxset = _SHORT.maxfrozenset = _SHORT.maxdeque = _SHORT.maxdict = 6
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 4, 60, 60
+
+
+def unit_suffix(unit: str) -> str:
+    """Return what follows a number in this unit, such as " min"; nothing for "" and for "1", a pure number."""
+    return "" if unit in ("", "1") else f" {unit}"
+
+
+def shorten(value: Any) -> str:
+    """Return any value as text for a message: at most `LONGEST_SHOWN_VALUE` characters."""
+    try:
+        is_small = hasattr(value, "tolist") and np.size(value) <= 8
+        text = " ".join(_SHORT.repr(value.tolist() if is_small else value).split())
+    except Exception:  # a faulty __repr__
+        text = f"an object of type {type(value).__name__}"
+    return text if len(text) <= LONGEST_SHOWN_VALUE else f"{text[: LONGEST_SHOWN_VALUE - 3]}..."
+
+
+def join_names(names: Iterable[Any]) -> str:
+    """Return names with commas between them, the first ten if there are more; 'none' for no names."""
+    return join_first((f"{name!s:.40}" for name in names), MOST_LISTED) or "none"
