@@ -14,7 +14,7 @@ import numpy as np
 import scipy.signal
 import scipy.special
 
-from switchfit.problem.validation.arrays import FloatArray
+from switchfit.arrays import FloatArray
 from switchfit.uncertainty.residuals import SERIOUS, UNLIKELY, compute_autocorrelation, correct_correlation
 
 RUNS = 2000

@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 import scipy.special
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.losses import influence, robust
-from switchfit.problem.validation.arrays import FloatArray
 
 RUNS = 2000
 LOSSES = (("huber", 1.5), ("soft_l1", 1.0), ("cauchy", 2.385))

@@ -5,7 +5,9 @@ import inspect
 import re
 from enum import EnumType
 
+import jax.numpy as jnp
 import matplotlib
+import numpy as np
 import pytest
 
 import switchfit as sf
@@ -13,6 +15,10 @@ from switchfit import models
 from switchfit.io.problem_file.loading import load_problem
 
 matplotlib.use("agg")
+
+
+NAMESPACE = {"sf": sf, "np": np, "jnp": jnp, "heater_problem": models.heater_problem}
+"""What every example may use without an import; `docs/api.rst` says so."""
 
 
 def public():
@@ -71,8 +77,7 @@ def test_there_are_examples_and_references_and_what_is_described_is_there(name):
 
 @pytest.mark.parametrize("name", [name for name, item in PUBLIC.items() if section(item, "Examples")])
 def test_examples_run_and_print_what_they_say(name, optimised_machine_code):
-    """Each by itself: what it needs, it imports."""
-    (examples,) = doctest.DocTestFinder(recurse=False).find(PUBLIC[name], name, globs={})
+    (examples,) = doctest.DocTestFinder(recurse=False).find(PUBLIC[name], name, globs=dict(NAMESPACE))
     report = []
     result = doctest.DocTestRunner(verbose=False).run(examples, out=report.append)
     assert result.failed == 0, "".join(report)

@@ -9,17 +9,17 @@ import switchfit as sf
 PACKAGE = Path(sf.__file__).parent
 
 LAYERS = (
-    "runtime", "optimize", "problem", "models", "discretization", "engine", "meshes", "paper_adjoint", "fit",
-    "uncertainty", "estimation", "strategy", "batch", "modes", "online", "experiment_design", "report", "io", "paper", "cli",
-    "__main__",
+    "arrays", "runtime", "optimize", "problem", "models", "discretization", "engine", "meshes", "paper_adjoint", "fit",
+    "uncertainty", "estimation", "strategy", "batch", "modes", "online", "experiment_design", "report", "io", "paper",
+    "cli", "__main__",
 )  # fmt: skip
 """From the bottom to the top; the package itself, which collects what is public, is above them all."""
 
-APART = {"optimize": set(), "models": {"problem"}}
+APART = {"optimize": {"arrays"}, "models": {"arrays", "problem"}}
 """Rooms that may import less than all before them."""
 
 
-LOGS = {"runtime", "problem.validation", "problem.dates", "problem.time_units"}
+LOGS = {"arrays", "runtime", "problem.validation", "problem.dates", "problem.time_units"}
 """Rooms and modules of other rooms that `io.logs` may import: it knows no model, no fit and no report."""
 
 OPTIONAL = {

@@ -43,6 +43,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments, build_arguments, split_by_cell
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate
@@ -60,7 +61,7 @@ from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.structure import Structure
 from switchfit.problem.validation import arrays, objects
 from switchfit.problem.validation import names as names_module
-from switchfit.problem.validation.arrays import FloatArray, as_count, as_positive
+from switchfit.problem.validation.arrays import as_count, as_positive
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.names import as_names
 from switchfit.runtime.cache import use_compilation_cache
@@ -514,8 +515,6 @@ class Design(DesignRecord, Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> plan = sf.design(heater_problem(), samples=4)
     >>> plan.sample_times["thermometer"].shape, plan.undetermined
     ((4,), ())
@@ -568,8 +567,6 @@ class Design(DesignRecord, Printed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> figure = sf.design(heater_problem(), samples=4).plot()
         >>> [ax.get_ylabel() for ax in figure.axes]
         ['T (K)', 'share of information']
@@ -593,8 +590,6 @@ class Design(DesignRecord, Printed):
         >>> import json
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> plan = sf.design(heater_problem(), samples=4)
         >>> with TemporaryDirectory() as folder:
         ...     plan.save(Path(folder) / "design.json")
@@ -679,8 +674,6 @@ def design(
     --------
     Four measurements instead of 24, those that tell most about the cooling k and the end of heating tau_1:
 
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> plan = sf.design(heater_problem(), samples=4)
     >>> plan.sample_times["thermometer"]
     array([1.75, 2.  , 2.25, 3.75])

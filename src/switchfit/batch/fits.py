@@ -26,6 +26,7 @@ from typing import Any, Self, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.batch.chunks import read_arrays, write_arrays
 from switchfit.batch.program import Ends
 from switchfit.estimation.estimator import Estimate, parse_fit, write_fit
@@ -34,7 +35,7 @@ from switchfit.optimize import Status
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray, as_level
+from switchfit.problem.validation.arrays import as_level
 from switchfit.problem.validation.objects import as_path
 from switchfit.runtime import special
 from switchfit.runtime.frames import Tabular
@@ -156,8 +157,6 @@ class Fits(Ends, Tabular, Displayed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fits = sf.estimate_many([heater_problem(), heater_problem()])
     >>> len(fits), fits.success, fits.verdict.level
     (2, array([ True,  True]), 'good')
@@ -242,8 +241,6 @@ class Fits(Ends, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fits = sf.estimate_many([heater_problem()])
         >>> fits.confidence_intervals(0.9).round(2)
         array([[[2.43, 2.49],
@@ -278,8 +275,6 @@ class Fits(Ends, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fits = sf.estimate_many([heater_problem(), heater_problem()])
 
         >>> [axes.get_xlabel() for axes in fits.plot().axes]
@@ -302,8 +297,6 @@ class Fits(Ends, Tabular, Displayed):
         --------
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fits = sf.estimate_many([heater_problem(), heater_problem()])
 
         >>> with TemporaryDirectory() as folder:
@@ -337,8 +330,6 @@ class Fits(Ends, Tabular, Displayed):
         --------
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
 
         >>> with TemporaryDirectory() as folder:
         ...     sf.multistart(heater_problem(), 8).save(Path(folder) / "starts.npz")

@@ -32,6 +32,7 @@ import numpy as np
 from jax import lax
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import derivatives_inside_program, runs_natively
@@ -50,7 +51,6 @@ from switchfit.problem.functions import use_float64
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.variables import Variables
 from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.issue import Issue

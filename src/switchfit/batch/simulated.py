@@ -40,6 +40,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.batch.fits import Fits, judge_study
 from switchfit.batch.program import Limits, Varying
 from switchfit.batch.study import LongRun, Study, repeat
@@ -53,7 +54,7 @@ from switchfit.fit.trajectory import compare, replace_values
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import arrays, names, objects
-from switchfit.problem.validation.arrays import FloatArray, as_array, as_count, as_seed
+from switchfit.problem.validation.arrays import as_array, as_count, as_seed
 from switchfit.problem.validation.messages import shorten
 from switchfit.runtime import special
 from switchfit.uncertainty.prediction import collect_sample_derivatives
@@ -87,8 +88,6 @@ class MonteCarlo(Fits):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> study = sf.monte_carlo(problem, 20, theta=[2.5, 0.4])
@@ -131,8 +130,6 @@ class MonteCarlo(Fits):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
         >>> study = sf.monte_carlo(problem, 20, theta=[2.5, 0.4])
@@ -207,8 +204,6 @@ def monte_carlo(
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> study = sf.monte_carlo(problem, 20, theta=[2.5, 0.4], seed=1)
@@ -397,8 +392,6 @@ class Bootstrap(Fits):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> found = sf.bootstrap(fit, 20)
@@ -447,8 +440,6 @@ class Bootstrap(Fits):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> low, high = sf.bootstrap(fit, 20).intervals(0.9).T
@@ -518,8 +509,6 @@ def bootstrap(
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> found = sf.bootstrap(fit, 20, resample="blocks", block=4, seed=1)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.batch.fits import Fits, judge_starts
 from switchfit.batch.program import Limits, describe_failure
 from switchfit.batch.study import LongRun, Study, repeat
@@ -21,7 +22,7 @@ from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem.problem import Problem, require_estimable
-from switchfit.problem.validation.arrays import FloatArray, as_array, as_count, as_seed
+from switchfit.problem.validation.arrays import as_array, as_count, as_seed
 from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.presentation import Drawn, draw_figure
@@ -55,8 +56,6 @@ class Multistart(Fits):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> found = sf.multistart(problem, 8)
@@ -86,8 +85,6 @@ class Multistart(Fits):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
         >>> figure = sf.multistart(problem, 8).plot()
@@ -144,8 +141,6 @@ def multistart(
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> found = sf.multistart(problem, 8, seed=1)

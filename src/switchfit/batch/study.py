@@ -28,6 +28,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.batch import fits as judged
 from switchfit.batch.chunks import Arrays, compute_fingerprint, run_chunks
 from switchfit.batch.fits import Fits, has_converged
@@ -44,7 +45,6 @@ from switchfit.optimize import Status
 from switchfit.optimize.traced_state import Outcome
 from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem, require_estimable
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.messages import join_names
 from switchfit.problem.validation.names import as_sequence
 from switchfit.problem.validation.objects import as_callable, as_instance, as_path
@@ -528,8 +528,6 @@ def estimate_many(
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fits = sf.estimate_many([heater_problem() for _ in range(3)])
     >>> fits.theta.shape, bool(fits.success.all())
     ((3, 2), True)

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.cli.examples import find_examples
 from switchfit.cli.files import refuse_existing
 from switchfit.cli.toml_writer import write_value
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import read_log
 from switchfit.problem.time_units import SECONDS_OF_UNIT
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import InputError
 
 LARGEST_COPY = 20_000_000

@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import InputError
 
 MOST_SIMULATED_TIMES = 10_000_000

@@ -13,12 +13,12 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
-from switchfit.problem.validation.arrays import FloatArray
 
 Array = jax.Array
 

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.problem.corners.timed import compile_timed_corners
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.functions import use_float64
 from switchfit.problem.padding import pad_length
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.cache import use_compilation_cache
 
 GRID, HALVINGS = 16, 60

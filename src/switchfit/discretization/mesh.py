@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.stiffness import Stiffness
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.padding import pad_length
-from switchfit.problem.validation.arrays import FloatArray
 
 SHARP = 1e-3
 """Part of the longest cell of a mesh below which its shortest one says that the model is sharp: 1e-6 to 1e-4 where

@@ -25,13 +25,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments, Samples
 from switchfit.discretization.signals import Array, Piece
 from switchfit.discretization.tableaus import select_tableaus
 from switchfit.problem.functions import Function
 from switchfit.problem.losses import influence, robust
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 
 Field = Callable[[Array, Array, Array], Array]
 """``f(t, x, p) -> (n,)`` of one mode, p being the flat vector of free parameters."""

@@ -41,8 +41,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.tableaus import Tableau
-from switchfit.problem.validation.arrays import FloatArray
 
 Array = Any
 """A JAX array, or a NumPy array of nodes."""

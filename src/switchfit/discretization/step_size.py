@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.rows import Array
-from switchfit.problem.validation.arrays import FloatArray
 
 SAFETY, SMALLEST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 MACHINE_EPSILON, SMALLEST_DOUBLE = float(np.finfo(float).eps), float(np.nextafter(0.0, 1.0))

@@ -25,8 +25,6 @@ class Stiffness:
 
     Examples
     --------
-    >>> import jax.numpy as jnp
-    >>> import switchfit as sf
     >>> fast = sf.HybridSystem({"relax": lambda t, x, p: -p["rate"] * (x - jnp.cos(t))}, [0.0])
     >>> run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("relax",), (), 0.0, 10.0)
     >>> problem = sf.Problem(fast, run, {"rate": 1e5})

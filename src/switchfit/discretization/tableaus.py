@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.problem.validation.arrays import FloatArray
+from switchfit.arrays import FloatArray
 
 # Stages 2 and 3 are both at c = 1/4; the third, which is the more accurate, makes the five times equidistant.
 EXPLICIT_BEND = np.array([1.0, 0.0, -4.0, 6.0, -4.0, 1.0])

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.corners.split_engine import SmoothEngine, SplitEngine
@@ -22,7 +23,6 @@ from switchfit.engine.native.sizes import Sizes
 from switchfit.engine.run import Run
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 
 REQUIRED = "engine='native' requires machine code, but {}. Leave engine out to evaluate with JAX."
 

@@ -7,8 +7,8 @@ from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.stiffness import Stiffness
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.presentation import format_line
 
 Matrix = Literal["exact", "gauss-newton", "none"]
@@ -78,8 +78,6 @@ class Evaluation(Generic[H_co]):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> evaluation = sf.evaluate(problem)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.validation.arrays import FloatArray
+from switchfit.arrays import FloatArray
 
 Column = IntEnum("Column", "PARENT BEFORE AFTER SLOT RESET_MAP TRANSITION_COST GUARD", start=0)
 """Columns of the table that makes children of hypotheses: (C, 7) of int64.

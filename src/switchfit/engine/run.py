@@ -7,6 +7,7 @@ from collections.abc import Container
 from dataclasses import replace
 from functools import cached_property
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments, build_common_arguments, put_on_mesh
 from switchfit.discretization.corner_times import find_corner_times
 from switchfit.discretization.mesh import Mesh
@@ -15,7 +16,6 @@ from switchfit.engine.corners.path import BranchPath
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 
 
 def take_implicit_steps(structure: Structure, modes: Container[str]) -> Structure:

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import find_row_ending_cell
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,12 +30,12 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit, invert, measure_quantile
 from switchfit.fit.trajectory import Trajectory, compare
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.names import as_choice
 from switchfit.problem.validation.objects import as_flag, as_instance, as_path
 from switchfit.runtime.files import write_atomically
@@ -107,8 +107,6 @@ class Estimate(Fit, Tabular, Displayed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> fit.success, fit.status.name
@@ -139,8 +137,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> len(fit.trajectories)
@@ -219,8 +215,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.report().splitlines()[0]
@@ -279,8 +273,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.covariance_from("gauss-newton").shape
@@ -321,8 +313,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.has_room_for_sensitivities()
@@ -351,8 +341,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> evaluator = fit.evaluator_at_solution()
@@ -394,8 +382,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.confidence_intervals(0.95).round(2)
@@ -431,8 +417,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> [round(float(end), 1) for end in fit.profile("tau_1").interval()]
@@ -454,8 +438,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.predict([1.0, 4.0]).outputs.round(1)
@@ -498,9 +480,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import numpy as np
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         The same heater on another day, switched off after 1.5 h:
@@ -538,8 +517,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> figure = fit.plot(bands=False)
@@ -562,8 +539,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> len(fit.plot_residuals().axes)
@@ -585,8 +560,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.plot_convergence().axes[0].get_xlabel()
@@ -610,8 +583,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> [text.get_text() for text in fit.plot_timeline().axes[0].texts]
@@ -647,8 +618,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> try:  # a drive with two positions has such a figure, a room with one thermometer has none
@@ -677,8 +646,6 @@ class Estimate(Fit, Tabular, Displayed):
         --------
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> with TemporaryDirectory() as folder:
@@ -703,8 +670,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> sorted(fit.describe_provenance().versions)[:3]
@@ -740,8 +705,6 @@ class Estimate(Fit, Tabular, Displayed):
         --------
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> with TemporaryDirectory() as folder:
@@ -772,8 +735,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.to_pandas()[["value", "std_error"]].round(3).to_dict("index")
@@ -793,8 +754,6 @@ class Estimate(Fit, Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.complete().saved_pieces.shape[0]
@@ -830,8 +789,6 @@ class Estimate(Fit, Tabular, Displayed):
         --------
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> with TemporaryDirectory() as folder:

@@ -14,6 +14,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower, constraint_errors, cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
@@ -27,7 +28,7 @@ from switchfit.optimize.minimization_problem import HessianKind
 from switchfit.optimize.stationary_points import NEGATIVE_CURVATURE
 from switchfit.problem.comparisons import find_comparisons, find_cost_corner
 from switchfit.problem.problem import Problem, keep_with_problem
-from switchfit.problem.validation.arrays import FloatArray, as_count, as_positive
+from switchfit.problem.validation.arrays import as_count, as_positive
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.names import as_choice
 from switchfit.runtime.errors import NotIntegrableError

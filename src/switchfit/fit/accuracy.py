@@ -38,6 +38,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, list_transition_functions
@@ -48,7 +49,6 @@ from switchfit.meshes.refinement import refine_mesh_of_run
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.errors import NotIntegrableError
 

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.stiffness import Stiffness
@@ -40,7 +41,6 @@ from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.reference_signals import ReferenceSignal
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.names import as_choice
 from switchfit.problem.validation.objects import as_instance
@@ -345,8 +345,6 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> exact, paper = (sf.evaluate(problem, method=method) for method in ("autodiff", "adjoint"))
@@ -382,8 +380,6 @@ class GuardedEvaluation:
 
     Examples
     --------
-    >>> import numpy as np
-    >>> import switchfit as sf
     >>> one = np.ones(1)
     >>> found = sf.GuardedEvaluation(np.array([0.45, 9.8]), ("g",), 2.0, one, np.eye(1), 0.45 * one, -0.02 * np.eye(1))
     >>> found.names, found.cost
@@ -429,8 +425,6 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
 
     Examples
     --------
-    >>> import jax.numpy as jnp
-    >>> import switchfit as sf
     >>> fall = lambda t, x, p: jnp.array([x[1], -p["g"]])
     >>> rest = lambda t, x, p: jnp.zeros(2)
     >>> guards = {("fall", "rest"): lambda t, x, p: x[0]}

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.engine.evaluation import Engine
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Result, Status
@@ -23,7 +24,7 @@ from switchfit.problem.comparisons import find_comparisons
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.problem import Problem
 from switchfit.problem.reads import find_unread
-from switchfit.problem.validation.arrays import FloatArray, as_level
+from switchfit.problem.validation.arrays import as_level
 from switchfit.runtime import special
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import Printed
@@ -67,7 +68,6 @@ class Kink(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> kink = sf.Kink("tau_1", value=2.0, left=-0.3, right=0.4)
     >>> kink.left < 0 < kink.right
     True
@@ -111,8 +111,6 @@ class Termination(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> fit.termination.status.name
@@ -251,8 +249,6 @@ class Step:
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> [step.strategy for step in sf.estimate(heater_problem(), strategy="thorough").steps][0]
     'local'
     """
@@ -542,8 +538,6 @@ class Fit(Termination):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> round(fit.quantile(0.95), 2)
@@ -569,8 +563,6 @@ class Fit(Termination):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.confidence_intervals(0.95).round(2)
@@ -588,8 +580,6 @@ class Fit(Termination):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> bool((fit.build_intervals(0.0 * fit.theta + 1.0)[:, 1] == fit.theta + 1.0).all())

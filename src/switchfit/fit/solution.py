@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.model import Model
 from switchfit.discretization.rows import stages
 from switchfit.discretization.signals import Piece
@@ -53,7 +54,6 @@ from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.reads import find_unread
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.variables import Variables
 from switchfit.runtime.errors import HiddenSwitchError
 from switchfit.runtime.issue import Issue

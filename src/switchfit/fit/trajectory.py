@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.engine.choice import engine_of
 from switchfit.engine.run import runs_of
 from switchfit.engine.simulation import Simulation
@@ -19,7 +20,7 @@ from switchfit.problem.experiment import Experiment, count_times, drop_jumps, sh
 from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.reference_signals import ReferenceSignal
-from switchfit.problem.validation.arrays import FloatArray, as_array, as_index
+from switchfit.problem.validation.arrays import as_array, as_index
 from switchfit.problem.validation.messages import unit_suffix
 from switchfit.problem.validation.objects import as_instance, set_fields
 from switchfit.runtime.frames import Tabular
@@ -53,8 +54,6 @@ class Trajectory(Tabular):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> path = sf.simulate(problem)
@@ -132,8 +131,6 @@ class Comparison:
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> comparison = fit.comparisons[0][0]
@@ -226,8 +223,6 @@ def simulate(
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> path = sf.simulate(problem, [2.5, 0.4])

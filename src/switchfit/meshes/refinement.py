@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.stiffness import Stiffness
 from switchfit.engine.adaptive.integrator import MAX_STEPS, PACE, SolveSettings
@@ -19,7 +20,6 @@ from switchfit.engine.adaptive.stiffness import TooManyStepsError, Watch
 from switchfit.engine.run import Run, runs_of
 from switchfit.meshes.implicit_modes import STEPS_BETWEEN_AFTER_FAILURE, ImplicitModes
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import NotIntegrableError
 
 MOST_TIMES_FEWEST_STEPS = 10

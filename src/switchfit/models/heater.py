@@ -36,8 +36,6 @@ def heater_problem() -> Problem:
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> sf.estimate(heater_problem()).theta.round(1)
     array([2.5, 0.4])
     """

@@ -69,7 +69,6 @@ def rolling_body(
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> from switchfit.models import rolling_body
     >>> ball, rolls_at = rolling_body(radius=0.11, mu=0.2), 7.0 / (0.2 * 9.81 * 3.5)
     >>> run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), ("skid", "roll"), (rolls_at,), 0.0, 2.0)

@@ -157,7 +157,6 @@ def skid_steer(
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> from switchfit.models import skid_steer
     >>> vehicle = skid_steer(modes=("stick", "front_slip", "slip"), restick="reset", mu_front="mu_f", mu_rear=0.6)
     >>> sorted(vehicle.reset_maps)

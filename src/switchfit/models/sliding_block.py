@@ -45,7 +45,6 @@ def sliding_block(*, g: Constant = 9.81) -> HybridSystem:
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> from switchfit.models import sliding_block
 
     A block that starts with 2 m/s and comes to rest after ``v / (mu g)`` = 0.51 s:

@@ -34,10 +34,10 @@ from typing import Literal
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime import special
 from switchfit.uncertainty.residuals import explain_all
 from switchfit.uncertainty.verdict import NEARLY_ALL

@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.rates import compute_rates
@@ -39,7 +40,6 @@ from switchfit.modes.schedule import (
     splice,
     spread,
 )
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.progress import show_detail
 from switchfit.strategy.beam import Proposal
 from switchfit.strategy.hops import choose_hops, is_lower

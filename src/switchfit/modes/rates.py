@@ -26,12 +26,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.engine.simulation import Costates
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory, compare
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.validation.arrays import FloatArray, as_count
+from switchfit.problem.validation.arrays import as_count
 from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.presentation import Printed, draw_figure, format_line
 
@@ -72,8 +73,6 @@ class Insertion(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> rate = sf.insertion(heater_problem())
     >>> rate.modes, rate.rate.shape == (len(rate.times), 2)
     (('on', 'off'), True)
@@ -100,8 +99,6 @@ class Insertion(Printed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> mode, time = sf.insertion(heater_problem()).best()
         >>> mode, 2.0 <= time <= 3.0
         ('on', True)
@@ -123,8 +120,6 @@ class Insertion(Printed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> pulses = sf.insertion(heater_problem()).minima()
         >>> all(pulse.rate < 0 for pulse in pulses)
         True
@@ -157,8 +152,6 @@ class Insertion(Printed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> figure = sf.insertion(heater_problem()).plot()
         >>> figure.axes[0].get_ylabel()
         'dJ / d length of a pulse (1/h)'
@@ -210,8 +203,6 @@ def insertion(problem: Problem, theta: ArrayLike | None = None) -> Insertion | t
     --------
     A run that was fitted without the mode in its middle:
 
-    >>> import numpy as np
-    >>> import switchfit as sf
     >>> system = sf.HybridSystem({"rest": lambda t, x, p: 0.0 * x, "rise": lambda t, x, p: 0.0 * x + 1.0}, [0.0])
     >>> times = np.linspace(0.0, 10.0, 21)
     >>> log = sf.Measurements(times, np.clip(times - 4.0, 0.0, 2.0), sigma=0.1)

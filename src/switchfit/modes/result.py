@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.batch.fits import describe_best, load_best
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
@@ -23,7 +24,7 @@ from switchfit.modes.fitter import Fitted, build_library_problem
 from switchfit.modes.schedule import Schedule, keep_off, spread
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray, as_array, as_index
+from switchfit.problem.validation.arrays import as_array, as_index
 from switchfit.problem.validation.messages import join_names
 from switchfit.problem.validation.objects import as_instance, as_path
 from switchfit.runtime.json_documents import read_document, write_document
@@ -45,7 +46,6 @@ class ModeStatus(Enum):
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> sf.ModeStatus.FOUND.successful
     True
     """
@@ -104,8 +104,6 @@ class ModeEnding(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> search = sf.find_modes(heater_problem(), max_switches=1)
     >>> search.ending.status.name, search.ending.limit
     ('AT_LIMIT', 1)
@@ -162,7 +160,6 @@ class ModeWarning(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> print(sf.ModeWarning("criteria differ", criterion="mbic", switches=1))
     mBIC prefers 1 switch.
     """
@@ -268,8 +265,6 @@ class ModeFit:
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> search = sf.find_modes(heater_problem(), max_switches=2)
     >>> [fit.switches for fit in search.fitted]
     [0, 1, 2]
@@ -357,8 +352,6 @@ class ModeSearch(SearchRecord, Displayed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> search = sf.find_modes(heater_problem(), max_switches=3)
     >>> search.mode_sequence, search.status.name
     (('on', 'off'), 'FOUND')
@@ -492,8 +485,6 @@ class ModeSearch(SearchRecord, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> search = sf.find_modes(heater_problem(), max_switches=2)
         >>> search.modes, search.mode_probability([0.5]).round(2)
         (('on', 'off'), array([[1., 0.]]))
@@ -522,8 +513,6 @@ class ModeSearch(SearchRecord, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> search = sf.find_modes(heater_problem(), max_switches=2)
         >>> len(search.plot().axes)
         3
@@ -545,8 +534,6 @@ class ModeSearch(SearchRecord, Displayed):
         --------
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> search = sf.find_modes(heater_problem(), max_switches=2)
         >>> with TemporaryDirectory() as folder:
         ...     search.save(Path(folder) / "modes.json")
@@ -584,8 +571,6 @@ class ModeSearch(SearchRecord, Displayed):
         --------
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> search = sf.find_modes(heater_problem(), max_switches=2)
         >>> with TemporaryDirectory() as folder:
         ...     search.save(Path(folder) / "modes.json")

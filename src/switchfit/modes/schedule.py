@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.problem.validation.arrays import FloatArray
+from switchfit.arrays import FloatArray
 from switchfit.strategy.beam import keep_apart
 from switchfit.strategy.library import Library
 

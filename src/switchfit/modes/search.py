@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.conclusion import Judge, look_around
 from switchfit.modes.criterion import (
@@ -32,7 +33,7 @@ from switchfit.modes.result import Certifier, ModeEnding, ModeSearch, ModeStatus
 from switchfit.modes.schedule import Schedule
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem, require_samples
-from switchfit.problem.validation.arrays import FloatArray, as_array, as_count, as_finite, as_positive, as_seed
+from switchfit.problem.validation.arrays import as_array, as_count, as_finite, as_positive, as_seed
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.names import as_choice
 from switchfit.problem.validation.objects import as_callable, as_instance
@@ -84,8 +85,6 @@ class SearchProgress(NamedTuple):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> seen = []
     >>> search = sf.find_modes(heater_problem(), max_switches=2, callback=seen.append)
     >>> seen[-1].sequences, seen[-1].fits == search.fits
@@ -196,8 +195,6 @@ def find_modes(
     --------
     A heater was on at first. Was it switched off, and on again?
 
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> search = sf.find_modes(heater_problem(), first="on", max_switches=3)
     >>> search.mode_sequence, search.transition_times[0].round(1)
     (('on', 'off'), array([2.5]))

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.engine.hypotheses import Hypotheses
 from switchfit.estimation.estimator import Estimate
 from switchfit.online.state import Alarm, Best, Now, OnlineStatus, build_kept_problem, calibrate, hold, read_sigma
@@ -43,15 +44,7 @@ from switchfit.online.tracker import (
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
-from switchfit.problem.validation.arrays import (
-    FloatArray,
-    as_array,
-    as_count,
-    as_finite,
-    as_index,
-    as_number,
-    as_positive,
-)
+from switchfit.problem.validation.arrays import as_array, as_count, as_finite, as_index, as_number, as_positive
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.names import as_names, require_known
 from switchfit.problem.validation.objects import as_instance, as_path
@@ -139,9 +132,6 @@ class OnlineEstimator:
     --------
     A heater that is switched off at 2 s, measured five times a second:
 
-    >>> import jax.numpy as jnp
-    >>> import numpy as np
-    >>> import switchfit as sf
     >>> heat, cool = (lambda t, x, p: p["a"] - x), (lambda t, x, p: -x)
     >>> sensor = sf.Measurements([0.2, 0.4], [0.0, 0.0], sigma=0.01)
     >>> run = sf.Experiment(sensor, ("heat",), t0=0.0, tf=4.0, initial_state=[0.0])
@@ -237,8 +227,6 @@ class OnlineEstimator:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> online = sf.OnlineEstimator(heater_problem())
         >>> online.build_like(online.problem, threshold=20.0).threshold
         20.0
@@ -254,8 +242,6 @@ class OnlineEstimator:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> online = sf.OnlineEstimator(heater_problem())
         >>> online.set_threshold(20.0)
         >>> online.threshold
@@ -274,8 +260,6 @@ class OnlineEstimator:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> online = sf.OnlineEstimator(heater_problem())
         >>> now = online.update(0.1, [0.5])
         >>> online.reset()
@@ -329,8 +313,6 @@ class OnlineEstimator:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> online = sf.OnlineEstimator(heater_problem())
         >>> now = online.update(0.1, [0.5])
         >>> now.time, now.mode
@@ -517,8 +499,6 @@ class OnlineEstimator:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> online = sf.OnlineEstimator(heater_problem())
         >>> for k in range(1, 9):
         ...     now = online.update(0.1 * k, [0.4 * k])
@@ -550,8 +530,6 @@ class OnlineEstimator:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> online = sf.OnlineEstimator(heater_problem())
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
@@ -586,8 +564,6 @@ class OnlineEstimator:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> online = sf.OnlineEstimator(heater_problem())
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
@@ -637,8 +613,6 @@ class OnlineEstimator:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> online = sf.OnlineEstimator(heater_problem())
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory

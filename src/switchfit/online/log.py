@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.online.estimator import OnlineEstimator
 from switchfit.online.state import Alarm, Now, OnlineStatus, list_updates
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray, as_array
+from switchfit.problem.validation.arrays import as_array
 from switchfit.problem.validation.objects import as_callable, as_instances
 from switchfit.runtime.presentation import Printed, draw_figure, format_line
 
@@ -56,8 +57,6 @@ class OnlineLog(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> log = sf.replay(heater_problem(), threshold=20.0)
     >>> log.times.shape == log.since.shape == log.statistic.shape
     True
@@ -98,8 +97,6 @@ class OnlineLog(Printed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> sf.replay(heater_problem()).delays([2.0]).shape
         (1,)
         """
@@ -120,8 +117,6 @@ class OnlineLog(Printed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> sorted(sf.replay(heater_problem()).latency())
         ['max', 'p50', 'p90', 'p99']
         """
@@ -137,8 +132,6 @@ class OnlineLog(Printed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> figure = sf.replay(heater_problem()).plot()
         """
         return draw_figure(self)
@@ -213,8 +206,6 @@ def replay(
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> log = sf.replay(heater_problem(), threshold=20.0)
     >>> [(alarm.mode, round(alarm.transition_time, 1)) for alarm in log.alarms]
     [('off', 2.5)]

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import compare
 from switchfit.modes.schedule import Schedule, drop_empty
@@ -24,7 +25,7 @@ from switchfit.problem.inputs import Input
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray, as_count, as_number, as_positive
+from switchfit.problem.validation.arrays import as_count, as_number, as_positive
 from switchfit.problem.validation.messages import shorten
 from switchfit.runtime.presentation import format_line
 
@@ -51,8 +52,6 @@ class OnlineStatus(Enum):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> sf.OnlineEstimator(heater_problem()).update(0.1).status.name
     'WAITING'
     """
@@ -90,8 +89,6 @@ class Alarm(NamedTuple):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> sf.replay(heater_problem(), threshold=20.0).alarms[0].mode
     'off'
     """
@@ -178,8 +175,6 @@ class Now:
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> now = sf.OnlineEstimator(heater_problem()).update(0.1, [0.5])
     >>> now.state.shape, now.covariance.shape
     ((1,), (1, 1))
@@ -261,8 +256,6 @@ class Calibration(NamedTuple):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> found = sf.calibrate(sf.OnlineEstimator(heater_problem()), false_alarms=0.01, seconds=2.0, runs=10)
     >>> found.seconds, len(found.maxima)
     (2.0, 10)
@@ -328,8 +321,6 @@ def calibrate(
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> online = sf.OnlineEstimator(heater_problem())
     >>> found = sf.calibrate(online, false_alarms=0.01, seconds=2.0, runs=10)
     >>> len(found.maxima)

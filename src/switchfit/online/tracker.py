@@ -33,9 +33,9 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.engine.hypotheses import Column, Hypotheses, HypothesisLimits
 from switchfit.engine.native.native_hypotheses import NativeHypotheses
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.strategy.beam import Beam, Pass
 from switchfit.strategy.library import Integers, Rules, Sequences, encode, select_lowest
 

@@ -11,11 +11,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
+from switchfit.arrays import FloatArray
 
 Array = Any
 """An array of NumPy or of JAX."""

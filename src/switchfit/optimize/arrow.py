@@ -22,8 +22,8 @@ from functools import cached_property
 
 import numpy as np
 
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.optimize import algebra, qp
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.curvature import FreeCurvature, Spectrum
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.positive_definite import STIFFENINGS, compose

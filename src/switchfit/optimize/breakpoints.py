@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import EPS, FloatArray
+from switchfit.arrays import FloatArray
+from switchfit.optimize.algebra import EPS
 from switchfit.optimize.linear_constraints import LinearConstraints
 
 

@@ -23,8 +23,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import FloatArray
 from switchfit.optimize.equalities import Equalities, JacobianSVD
 from switchfit.optimize.positive_definite import CholeskyFactor, shift_to_positive
 from switchfit.optimize.qp import Room, solve_in_span, solve_programme

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import BoolArray, FloatArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import BoolArray, FloatArray
 
 
 class Spectrum(NamedTuple):

@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.optimize import algebra, positive_definite, qp
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.curvature import FreeCurvature, Spectrum, null_space
 from switchfit.optimize.positive_definite import Change, CholeskyFactor, make_absolute, make_convex_on_face
 from switchfit.optimize.qp import Room

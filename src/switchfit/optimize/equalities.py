@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import FloatArray
 
 DEPENDENT = 1e-10
 """Rows of a Jacobian are dependent where a singular value is below this part of the largest one."""

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import FloatArray, IntArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import FloatArray, IntArray
 from switchfit.optimize.feasibility import move
 from switchfit.optimize.oracle import Oracle
 from switchfit.optimize.result import LineSearchFailure

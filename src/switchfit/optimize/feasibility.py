@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, largest, project_on_row
+from switchfit.arrays import BoolArray, FloatArray
+from switchfit.optimize.algebra import EPS, largest, project_on_row
 from switchfit.optimize.linear_constraints import LinearConstraints
 from switchfit.optimize.minimization_problem import MinimizationProblem
 

@@ -18,8 +18,8 @@ from itertools import product
 
 import numpy as np
 
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.least_distance import find_least_distance
 
 #: All combinations of sides are compared for up to this many concave kinks that constraints couple.

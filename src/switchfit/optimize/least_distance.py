@@ -14,8 +14,8 @@ from __future__ import annotations
 import daqp
 import numpy as np
 
+from switchfit.arrays import BoolArray, FloatArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import BoolArray, FloatArray
 from switchfit.optimize.linear_constraints import LinearConstraints
 
 TOLERANCES = 1e-12, 1e-10, 1e-8, 1e-6

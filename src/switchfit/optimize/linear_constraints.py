@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 
 NO_PLACES = np.zeros(0, dtype=np.intp)
 """No places."""

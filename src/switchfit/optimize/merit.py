@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from switchfit.optimize.algebra import FloatArray
+from switchfit.arrays import FloatArray
 from switchfit.optimize.composite_step import find_normal_step
 from switchfit.optimize.feasibility import Trial, move
 from switchfit.optimize.oracle import Oracle

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.optimize.breakpoints import Breakpoints
 from switchfit.optimize.linear_constraints import LinearConstraints
 

@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.arrow import Arrow, Hessian
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.equalities import Equalities, JacobianSVD
@@ -36,8 +36,8 @@ class Oracle:
         Of the equality constraints, with which the Hessian of the Lagrangian is evaluated next.
     units : array, shape (k,), or None
         Units of the equality constraints: the lengths of their gradients over `MinimizationProblem.reach` at the first
-        point, or later if these have grown by a factor of `GROWN`. Constraints and multipliers are in these units everywhere
-        except in the caller's function.
+        point, or later if these have grown by a factor of `GROWN`. Constraints and multipliers are in these units
+        everywhere except in the caller's function.
     """
 
     def __init__(self, problem: MinimizationProblem, multipliers: ArrayLike | None = None) -> None:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.arrow import Hessian
 from switchfit.optimize.curvature import FreeCurvature
 from switchfit.optimize.equalities import Equalities

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.optimize import algebra, lapack, positive_definite
-from switchfit.optimize.algebra import FloatArray
 
 Change = Callable[[FloatArray], FloatArray]
 """Returns another matrix (d, d)."""

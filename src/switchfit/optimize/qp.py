@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.least_distance import find_least_distance
 from switchfit.optimize.linear_constraints import LinearConstraints
 from switchfit.optimize.positive_definite import CholeskyFactor

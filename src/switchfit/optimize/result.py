@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from switchfit.optimize.algebra import FloatArray
+from switchfit.arrays import FloatArray
 from switchfit.optimize.curvature import FreeCurvature
 from switchfit.optimize.status import Status
 

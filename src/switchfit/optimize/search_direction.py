@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.arrow import Hessian
 from switchfit.optimize.composite_step import find_normal_step, solve_composite
 from switchfit.optimize.dense import Dense

@@ -29,8 +29,8 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import FloatArray
 from switchfit.optimize import algebra, failure, line_search, merit, search_direction, trust_region
-from switchfit.optimize.algebra import FloatArray
 from switchfit.optimize.curvature import FreeCurvature, Spectrum
 from switchfit.optimize.feasibility import Trial, feasible_start
 from switchfit.optimize.minimization_problem import MinimizationProblem

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.curvature import FreeCurvature
 from switchfit.optimize.minimization_problem import MinimizationProblem
 from switchfit.optimize.point import Point

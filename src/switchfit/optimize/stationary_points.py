@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.optimize import algebra, merit, search_direction
-from switchfit.optimize.algebra import FloatArray
 from switchfit.optimize.feasibility import Trial, move, snap_to_rows
 from switchfit.optimize.oracle import Oracle
 from switchfit.optimize.point import MET

@@ -14,8 +14,6 @@ class Status(Enum):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> fit.status is sf.Status.CONVERGED

@@ -10,8 +10,8 @@ from typing import Self
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import FloatArray
 
 
 class SymmetricMatrix:

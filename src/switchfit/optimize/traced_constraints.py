@@ -11,8 +11,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
+from switchfit.arrays import IntArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import Array, IntArray
+from switchfit.optimize.algebra import Array
 
 
 class TracedConstraints(NamedTuple):

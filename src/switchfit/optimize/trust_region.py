@@ -18,8 +18,8 @@ import math
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import FloatArray
 from switchfit.optimize.minimization_problem import MinimizationProblem
 from switchfit.optimize.search_direction import SearchDirection
 

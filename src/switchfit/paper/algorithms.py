@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import expm
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.optimize.minimization_problem import HessianKind
@@ -28,7 +29,6 @@ from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.reference_signals import ReferenceSignal
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.validation.arrays import FloatArray
 
 KINDS: tuple[HessianKind, ...] = ("none", "block-diagonal", "exact", "descent-first")
 

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.paper import vehicle
 from switchfit.paper.vehicle import BLUE, DARK, HORIZON, NAMES, PAGE, RED, SYMBOLS, TRUTH, Figure, Found, Row, Say, tidy
 from switchfit.problem.measurements import Measurements
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.choice import estimate, was_interrupted
 

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.trajectory import Trajectory, simulate
@@ -25,7 +26,6 @@ from switchfit.problem.inputs import Input
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.reference_signals import ReferenceSignal
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.presentation import Axes
 from switchfit.runtime.presentation import Figure as Figure
 from switchfit.uncertainty.certificate import certify

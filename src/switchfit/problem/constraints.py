@@ -57,8 +57,6 @@ class ActiveConstraint(Constraint):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
     >>> bounded = {**problem.parameters, "k": sf.Parameter(0.3, upper=0.35, unit="1/h")}
     >>> fit = sf.estimate(sf.Problem(problem.system, problem.experiments[0], bounded))

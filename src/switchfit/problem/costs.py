@@ -24,7 +24,6 @@ class RunningCost:
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> effort = sf.RunningCost(lambda t, x, p: x[0] ** 2)
     >>> run = sf.Experiment(effort, ("on", "off"), (2.0,), 0.0, 4.0)
     >>> len(run.data)
@@ -51,7 +50,6 @@ class TerminalCost:
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> far = sf.TerminalCost(lambda x, p: -x[0])
     >>> run = sf.Experiment(far, ("go",), (), 0.0, 1.0)
     >>> len(run.data)
@@ -85,7 +83,6 @@ class TransitionCost:
     --------
     Switching from "push" to "brake" costs the square of the speed:
 
-    >>> import switchfit as sf
     >>> cost = sf.TransitionCost(lambda t, x, p: x[1] ** 2, before="push", after="brake")
     """
 
@@ -114,8 +111,6 @@ class TerminalConstraint:
 
     Examples
     --------
-    >>> import switchfit as sf
-
     The speed has to be zero at the end:
 
     >>> at_rest = sf.TerminalConstraint(lambda x, p: x[1])

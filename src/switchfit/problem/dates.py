@@ -309,7 +309,6 @@ def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> stamps = sf.from_epoch([1585000800000, 1585004400000, 1585008000000], "ms")
     >>> stamps
     3 dates from 2020-03-23T22:00:00+00:00 to 2020-03-24T00:00:00+00:00

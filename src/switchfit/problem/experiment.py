@@ -11,6 +11,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.data import Data, count_from
 from switchfit.problem.dates import list_dates, read_date, read_dates
 from switchfit.problem.inputs import Input
@@ -22,7 +23,7 @@ from switchfit.problem.parameter import as_parameter, require_time_unit
 from switchfit.problem.reference_signals import ReferenceSignal
 from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.system import HybridSystem, as_state
-from switchfit.problem.validation.arrays import FloatArray, as_number
+from switchfit.problem.validation.arrays import as_number
 from switchfit.problem.validation.messages import join_names, shorten, unit_suffix
 from switchfit.problem.validation.names import as_name, as_sequence
 from switchfit.problem.validation.objects import as_instance, as_instances, set_fields
@@ -108,7 +109,6 @@ class Experiment:
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> log = sf.Measurements([1.0, 2.0, 3.0, 4.0], [0.9, 1.8, 1.2, 0.7], sigma=0.1)
     >>> run = sf.Experiment(log, ("on", "off"), (2.2,), t0=0.0, time_unit="h")
     >>> run.mode_sequence, run.initial_times
@@ -301,7 +301,6 @@ class Experiment:
 
         Examples
         --------
-        >>> import switchfit as sf
         >>> cost = sf.RunningCost(lambda t, x, p: x[0])
         >>> run = sf.Experiment(cost, ("on", "off"), (1.0,), 0.0, sf.Parameter(2.5, upper=5.0))
         >>> run.ends_of_modes(run.initial_times)

@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.jaxprs import Walk, evaluate, find_line, find_public_name
-from switchfit.problem.validation.arrays import FloatArray
 
 GROWING = frozenset(
     {"add", "sub", "mul", "neg", "exp", "exp2", "expm1", "sinh", "cosh", "square", "dot_general", "reduce_sum"}

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.samples import check_samples
 from switchfit.problem.signals import PiecewisePolynomial, fit_spline
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.messages import shorten
 from switchfit.problem.validation.names import as_choice, as_labels, as_named_columns
 from switchfit.problem.validation.objects import set_fields
@@ -52,8 +52,6 @@ class Input:
 
     Examples
     --------
-    >>> import numpy as np
-    >>> import switchfit as sf
     >>> wheels = sf.Input([0.0, 1.0, 2.0], {"left": [0.0, 4.0, 4.0], "right": [0.0, 4.0, 5.0]}, kind="linear")
     >>> wheels.names
     ('left', 'right')
@@ -106,7 +104,6 @@ class Input:
 
         Examples
         --------
-        >>> import switchfit as sf
         >>> signal = sf.Input([0.0, 1.0], [0.0, 4.0], kind="linear").signal(0.0, 1.0)
         >>> signal([0.25, 0.5])
         array([[1.],

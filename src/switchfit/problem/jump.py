@@ -51,7 +51,6 @@ class Jump:
     --------
     Three doses of 100 mg, eight hours apart, into a body of unknown volume:
 
-    >>> import switchfit as sf
     >>> system = sf.HybridSystem({"eliminate": lambda t, x, p: -p["k"] * x}, [0.0])
     >>> doses = sf.Jump([0.0, 8.0, 16.0], lambda t, x, p: x + 100.0 / p["V"])
     >>> log = sf.Measurements([1.0, 7.0, 12.0, 24.0], [9.1, 4.9, 9.8, 7.4], sigma=0.3)

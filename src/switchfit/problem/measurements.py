@@ -8,9 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.losses import LOSSES
 from switchfit.problem.samples import Observe, check_channels, check_samples
-from switchfit.problem.validation.arrays import FloatArray, as_array, as_finite, as_positive, require_deviation
+from switchfit.problem.validation.arrays import as_array, as_finite, as_positive, require_deviation
 from switchfit.problem.validation.messages import shorten
 from switchfit.problem.validation.names import as_choice, as_name
 from switchfit.problem.validation.objects import set_fields
@@ -70,9 +71,6 @@ class Measurements:
 
     Examples
     --------
-    >>> import numpy as np
-    >>> import switchfit as sf
-
     Two channels of a state of three, one value missing, with noise of different size:
 
     >>> gps = sf.Measurements(
@@ -148,7 +146,6 @@ class Measurements:
 
         Examples
         --------
-        >>> import switchfit as sf
         >>> log = sf.Measurements([0.0, 1.0], [2.0, 3.0], sigma="noise")
         >>> log.noise({"noise": 0.5})
         array([[0.5],

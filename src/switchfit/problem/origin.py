@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.dates import Dates, Given, as_date, find_zone, format_instant, read_instant
 from switchfit.problem.time_units import SECONDS_OF_UNIT, TIMEDELTA_OF_UNIT, normalize_time_unit
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.names import as_name
 
 # --- the origin of an experiment --------------------------------------------------------------------------------------

@@ -7,9 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.dates import Dates, list_dates, read_date
 from switchfit.problem.priors import LogNormal, Normal, Prior, PriorTerms
-from switchfit.problem.validation.arrays import FloatArray, as_array
+from switchfit.problem.validation.arrays import as_array
 from switchfit.problem.validation.messages import shorten
 from switchfit.problem.validation.names import as_choice, as_name
 from switchfit.problem.validation.objects import as_flag, set_fields
@@ -55,7 +56,6 @@ class Parameter:
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> mu = sf.Parameter(0.8, lower=0.05, upper=2.0, unit="1")
     >>> rates = sf.Parameter([1e-3, 2.0], scale="log")
     >>> known = sf.Parameter(9.81, fixed=True)

@@ -42,7 +42,6 @@ class Normal:
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> mu = sf.Parameter(0.8, prior=sf.Normal(mean=0.7, sd=0.1))
     >>> mu.prior.sd
     array(0.1)
@@ -84,7 +83,6 @@ class LogNormal:
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> mu = sf.Parameter(0.8, lower=0.01, prior=sf.LogNormal(median=0.7, log_sd=0.1))
     >>> mu.prior.log_sd
     array(0.1)

@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.optimize import LinearConstraints
 from switchfit.problem.consistency import check_durations, check_names, check_parameters
 from switchfit.problem.constraints import Constraint, ConstraintKind
@@ -22,7 +23,7 @@ from switchfit.problem.structure import Structure
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.tracing import Sources, trace_structure
 from switchfit.problem.unknowns import Unknowns, list_unknowns
-from switchfit.problem.validation.arrays import FloatArray, as_array, as_count, as_positive
+from switchfit.problem.validation.arrays import as_array, as_count, as_positive
 from switchfit.problem.validation.messages import join_names, shorten, unit_suffix
 from switchfit.problem.validation.names import as_choice, require_known
 from switchfit.problem.validation.objects import as_instance, as_instances, set_fields
@@ -104,8 +105,6 @@ class Problem:
 
     Examples
     --------
-    >>> import switchfit as sf
-
     A heater that is switched off at an unknown time; what it loses to the room is unknown too:
 
     >>> system = sf.HybridSystem(
@@ -216,8 +215,6 @@ class Problem:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
         >>> problem.with_sequences([("off", "on", "off")], [(1.0, 3.0)]).theta_names
@@ -402,8 +399,6 @@ class Problem:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
         >>> problem.vectors(problem.initial_theta, 0)
@@ -446,8 +441,6 @@ class Problem:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
         >>> float(problem.name_parameters(problem.initial_theta, 0)["k"])
@@ -466,8 +459,6 @@ class Problem:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
         >>> problem.late_times(problem.initial_theta, 0)
@@ -491,8 +482,6 @@ class Problem:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
         >>> problem.check_theta(None)
@@ -549,8 +538,6 @@ class Problem:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
         >>> problem.ends_of_modes(problem.initial_theta)
@@ -575,8 +562,6 @@ class Problem:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> problem = heater_problem()
 
         >>> times, parameters = problem.split(problem.initial_theta)

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.dates import Dates
 from switchfit.problem.samples import Observe, check_channels, check_samples, count_seconds
 from switchfit.problem.signals import PiecewisePolynomial, filter_lowpass, fit_spline
-from switchfit.problem.validation.arrays import FloatArray, as_array, as_positive
+from switchfit.problem.validation.arrays import as_array, as_positive
 from switchfit.problem.validation.messages import shorten
 from switchfit.problem.validation.objects import as_instance, set_fields
 from switchfit.problem.validation.tables import find_labels
@@ -63,8 +64,6 @@ class ReferenceSignal:
 
     Examples
     --------
-    >>> import numpy as np
-    >>> import switchfit as sf
     >>> times = np.linspace(0.0, 2.0, 41)
     >>> reference = sf.ReferenceSignal.from_samples(times, np.sin(times), lowpass_hz=2.0)
     >>> reference.signal.channels
@@ -135,8 +134,6 @@ class ReferenceSignal:
 
         Examples
         --------
-        >>> import numpy as np
-        >>> import switchfit as sf
         >>> times = np.linspace(0.0, 2.0, 41)
         >>> reference = sf.ReferenceSignal.from_samples(times, np.sin(times))
         >>> reference.signal([1.0]).round(6)

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.dates import FIRST_DAY, Dates, read_dates
 from switchfit.problem.time_units import TIMEDELTA_OF_UNIT
-from switchfit.problem.validation.arrays import FloatArray, as_array
+from switchfit.problem.validation.arrays import as_array
 from switchfit.problem.validation.names import as_labels
 from switchfit.problem.validation.objects import as_callable, set_fields
 

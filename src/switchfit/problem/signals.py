@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.validation.arrays import FloatArray
+from switchfit.arrays import FloatArray
 
 MOST_FILTERED = 10**7
 """Largest number of points at which a signal is filtered."""

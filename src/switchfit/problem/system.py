@@ -67,9 +67,6 @@ class HybridSystem:
 
     Examples
     --------
-    >>> import jax.numpy as jnp
-    >>> import switchfit as sf
-
     A ball that falls until it reaches the ground, where it comes to rest:
 
     >>> system = sf.HybridSystem(
@@ -125,7 +122,6 @@ class HybridSystem:
 
         Examples
         --------
-        >>> import switchfit as sf
         >>> system = sf.HybridSystem({"rest": lambda t, x, p: 0 * x}, lambda p: p["x0"], state_names=("x", "y"))
         >>> system.check_labels_of(2)
         """

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.constraints import Constraint, ConstraintKind
 from switchfit.problem.experiment import Experiment, initial_state_of, name_runs, prefix_runs
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.messages import join_names, unit_suffix
 from switchfit.problem.variables import LEAST_PART_OF_GUESS, Variables
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.validation.arrays import FloatArray
+from switchfit.arrays import FloatArray
 
 ORDINARY = (1e-3, 1e3)
 """Range of sizes in which an unknown is not scaled; the tolerance on the gradient is then that of theta itself."""

@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num, num2date
 from matplotlib.ticker import Locator
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.origin import Origin
 from switchfit.problem.time_units import SECONDS_OF_UNIT, normalize_time_unit
-from switchfit.problem.validation.arrays import FloatArray
 
 MOST_TICKS = 6
 """There is room for as many in a narrow figure; with less than 5, matplotlib finds no interval for some spans."""

@@ -7,9 +7,10 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
-from switchfit.problem.validation.arrays import FloatArray, as_level
+from switchfit.problem.validation.arrays import as_level
 from switchfit.problem.validation.objects import as_flag
 from switchfit.report import style
 from switchfit.report.panels import (

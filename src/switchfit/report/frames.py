@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.batch.fits import Fits
 from switchfit.batch.simulated import Bootstrap
 from switchfit.batch.starts import Multistart
@@ -15,7 +16,6 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.time_units import SECONDS_OF_UNIT, normalize_time_unit
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.report.numbers import format_unit, get_unit
 from switchfit.report.times import format_iso, list_dated
 from switchfit.report.unknowns import list_holds

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.modes.result import ModeSearch
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.report import panels, style
 from switchfit.report.mode_endings import CRITERION_TITLES
 from switchfit.report.mode_search import list_criteria

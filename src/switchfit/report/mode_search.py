@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.modes.result import ModeFit, ModeSearch
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.report import numbers, tables
 from switchfit.report import times as times_module
 from switchfit.report.mode_endings import CRITERION_TITLES, name_criterion

@@ -6,8 +6,8 @@ from collections import Counter
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.online.log import OnlineLog
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.messages import unit_suffix
 from switchfit.report import numbers, panels, style, tables
 from switchfit.report import times as times_module

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import FloatArray
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory, find_delay
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.report import style
 from switchfit.report.numbers import format_unit, wrap_quantity
 from switchfit.report.style import (

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.batch.fits import Fits
 from switchfit.fit.result import Fit
 from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.time_units import SECONDS_OF_UNIT, normalize_time_unit
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.messages import unit_suffix
 from switchfit.report.numbers import format_rounded, label_quantity
 from switchfit.runtime.presentation import format_count

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.report import selection, times
 from switchfit.report.numbers import format_rounded, format_unit
 from switchfit.report.tables import Table, format_table, wrap_text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from switchfit.problem.validation.arrays import FloatArray
+from switchfit.arrays import FloatArray
 from switchfit.report import fit_figure, panels, selection, times
 from switchfit.report.residuals import format_probability
 from switchfit.report.style import SMALL

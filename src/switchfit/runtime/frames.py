@@ -71,9 +71,6 @@ class Tabular:
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-
         >>> table = sf.simulate(heater_problem()).to_pandas()
         >>> list(table.columns), table.index.name, table.attrs["units"]
         (['mode', 'T'], 'time', {'time': 'h', 'T': 'K'})

@@ -27,7 +27,6 @@ class Issue(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> issue = sf.Issue("error", ("the log is empty",))
     >>> issue.kind, issue.subjects
     ('error', ('the log is empty',))

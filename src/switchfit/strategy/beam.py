@@ -43,6 +43,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import hypotheses_of
@@ -55,7 +56,6 @@ from switchfit.problem.measurements import Measurements
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem, place_parameters
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.strategy.library import (
     PER_SEQUENCE,
     Children,

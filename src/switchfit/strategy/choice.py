@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.accuracy import Follower
@@ -27,7 +28,7 @@ from switchfit.optimize.minimization_problem import HessianKind
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.reference_signals import ReferenceSignal
-from switchfit.problem.validation.arrays import FloatArray, as_positive
+from switchfit.problem.validation.arrays import as_positive
 from switchfit.problem.validation.names import as_choice
 from switchfit.problem.validation.objects import as_callable, as_instance
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
@@ -299,8 +300,6 @@ def estimate(
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> fit = sf.estimate(problem)

@@ -26,12 +26,12 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.losses import robust
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.names import as_labels
 from switchfit.problem.validation.objects import as_instances
 from switchfit.runtime import special
@@ -113,8 +113,6 @@ class ModelComparison(Displayed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> known = dict(problem.parameters) | {"k": sf.Parameter(0.45, fixed=True)}
@@ -211,8 +209,6 @@ def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     Was the heater switched off at all?

@@ -31,13 +31,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.engine.corners.branches import has_corners
 from switchfit.engine.evaluation import Evaluation, Matrix
 from switchfit.fit.evaluator import Evaluator
 from switchfit.optimize import lapack
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.progress import show_detail
 from switchfit.strategy.beam import list_sample_times
 from switchfit.strategy.starts import End, OutOfTimeError, check_time, fit_briefly, make_feasible, prepare_meshes

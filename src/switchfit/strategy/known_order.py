@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.fit.evaluator import assume_noise
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.reference_signals import ReferenceSignal
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.progress import show_detail
 from switchfit.strategy.beam import REPLAYS, REPLAYS_OF_ORDER, Proposal, Quadratic, follow_order, prepare
 from switchfit.strategy.hops import hop_over_samples

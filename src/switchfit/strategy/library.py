@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.problem.consistency import check_durations
 from switchfit.problem.costs import TerminalConstraint, TransitionCost
@@ -23,7 +24,7 @@ from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Function, Structure
 from switchfit.problem.tracing import trace_structure
-from switchfit.problem.validation.arrays import FloatArray, as_count
+from switchfit.problem.validation.arrays import as_count
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.names import as_name, as_names, require_known
 

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.engine.evaluation import Evaluation
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import Follower
@@ -32,7 +33,6 @@ from switchfit.optimize import IterationRecord, LinearConstraints, Status
 from switchfit.optimize.least_distance import nearest_feasible
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import HiddenSwitchError
 from switchfit.runtime.progress import show_detail
 

@@ -42,6 +42,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit, invert
@@ -52,7 +53,7 @@ from switchfit.problem.experiment import Experiment, show_time
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray, as_level
+from switchfit.problem.validation.arrays import as_level
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.names import as_names
 from switchfit.problem.validation.tables import list_columns
@@ -319,7 +320,6 @@ class InputCorrelation(NamedTuple):
 
     Examples
     --------
-    >>> import switchfit as sf
     >>> sf.InputCorrelation("speed", "torque", probability=0.4, lags=5).input
     'torque'
     """
@@ -376,9 +376,6 @@ class Validation(Displayed):
 
     Examples
     --------
-    >>> import numpy as np
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     Fit every other reading, and predict the rest with the parameter and the transition time of its own:
@@ -483,8 +480,6 @@ class Validation(Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> round(fit.validate(fit.problem).quantile(0.95), 2)
@@ -506,8 +501,6 @@ class Validation(Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> len(fit.validate(fit.problem).plot().axes)

@@ -25,6 +25,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.engine.evaluation import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper, measure_variation
 from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum, moves_by_itself
@@ -37,7 +38,6 @@ from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.reads import find_unread
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.objects import as_flag, as_instance
 from switchfit.runtime import special
 from switchfit.runtime.issue import Issue
@@ -107,8 +107,6 @@ class DerivativeCheck(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> check = sf.check_derivatives(problem)
@@ -195,8 +193,6 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, paper
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> sf.check_derivatives(problem).passed
@@ -332,8 +328,6 @@ class Direction:
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> worst = fit.identifiability.directions[0]
@@ -395,8 +389,6 @@ class Identifiability(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> found = fit.identifiability
@@ -461,8 +453,6 @@ def identifiability(subject: Any) -> Identifiability:
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> problem = heater_problem()
 
     >>> found = sf.identifiability(problem)
@@ -643,8 +633,6 @@ class Certificate(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> fit.certificate.failures

@@ -36,6 +36,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.run import runs_of
@@ -49,7 +50,7 @@ from switchfit.problem.losses import influence
 from switchfit.problem.origin import Origin
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray, as_index, as_level
+from switchfit.problem.validation.arrays import as_index, as_level
 from switchfit.problem.validation.messages import unit_suffix
 from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.frames import Tabular
@@ -272,8 +273,6 @@ class Prediction(Tabular):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> prediction = fit.predict([1.0, 4.0])
@@ -322,8 +321,6 @@ class Prediction(Tabular):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.predict([1.0, 4.0]).state_band(0.95).round(1)
@@ -342,8 +339,6 @@ class Prediction(Tabular):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.predict([1.0, 4.0]).output_band(0.95).round(1)
@@ -362,8 +357,6 @@ class Prediction(Tabular):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.predict([1.0, 4.0]).prediction_band(0.95).round(1)
@@ -387,9 +380,6 @@ class Prediction(Tabular):
 
         Examples
         --------
-        >>> import numpy as np
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> len(fit.predict(np.linspace(0.0, 9.0, 200)).plot().axes)
@@ -436,8 +426,6 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> prediction = sf.predict(fit, [1.0, 4.0])

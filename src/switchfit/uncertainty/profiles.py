@@ -38,6 +38,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
@@ -45,7 +46,7 @@ from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Status
 from switchfit.optimize.least_distance import nearest_feasible
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray, as_level
+from switchfit.problem.validation.arrays import as_level
 from switchfit.problem.validation.messages import join_names, shorten, unit_suffix
 from switchfit.problem.validation.names import as_name
 from switchfit.problem.validation.objects import as_callable, as_flag, as_instance
@@ -160,8 +161,6 @@ class Profile(Tabular, Displayed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> found = sf.profile(fit, "tau_1")
@@ -264,8 +263,6 @@ class Profile(Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> len(sf.profile(fit, "k").regions(0.95))
@@ -292,8 +289,6 @@ class Profile(Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> [round(float(end), 2) for end in sf.profile(fit, "k").interval(0.95)]
@@ -316,8 +311,6 @@ class Profile(Tabular, Displayed):
 
         Examples
         --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
         >>> figure = sf.profile(fit, "k").plot()
@@ -576,8 +569,6 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> [round(float(end), 1) for end in sf.profile(fit, "tau_1").interval(0.95)]

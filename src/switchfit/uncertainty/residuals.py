@@ -36,11 +36,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.fit.evaluator import NO_VARIATION
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.origin import Origin
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime import special
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import Printed, format_line, join_first
@@ -106,8 +106,6 @@ class ChannelResiduals:
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> channel = fit.residuals.channels[0]
@@ -177,8 +175,6 @@ class ResidualDiagnostics(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> fit.residuals.passed, fit.residuals.labels

@@ -353,8 +353,6 @@ class Verdict(Printed):
 
     Examples
     --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
     >>> fit = sf.estimate(heater_problem())
 
     >>> fit.verdict.level

@@ -43,11 +43,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation.arrays import FloatArray
 
 MOST_HALVINGS = 3
 """Times on one side that a piece is cut off halfway to the end of the interval that it predicts ..."""

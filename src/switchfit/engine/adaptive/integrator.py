@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, read_parameters
 from switchfit.discretization.signals import Piece
@@ -31,7 +32,6 @@ from switchfit.engine.run import Run, take_implicit_steps
 from switchfit.problem.finiteness import find_undefined
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.messages import unit_suffix
 from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.errors import NotIntegrableError

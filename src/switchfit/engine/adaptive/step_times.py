@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from switchfit.arrays import FloatArray
 from switchfit.engine.adaptive.integrator import Integrator, SolveSettings
 from switchfit.engine.corners import branches, course
 from switchfit.engine.corners.path_search import find_path
 from switchfit.engine.run import Run
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import NotIntegrableError
 
 USUAL_SETTINGS = SolveSettings()

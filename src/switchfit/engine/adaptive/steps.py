@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.step_size import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
 from switchfit.engine.native.loops.adaptive_steps import AT
 from switchfit.engine.native.native_experiment import NativeExperiment
 from switchfit.problem.functions import use_float64
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.errors import NotIntegrableError
 

@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.mesh import MANY_STEPS, Mesh
-from switchfit.problem.validation.arrays import FloatArray
 
 STEPS_BETWEEN = 250
 """Accepted steps in a mode between two states at which its eigenvalues are computed."""

@@ -9,10 +9,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.engine.native.tracing.trace import trace_scalars
 from switchfit.engine.native.tracing.unsupported import Unsupported
 from switchfit.problem.functions import Function, use_float64
-from switchfit.problem.validation.arrays import FloatArray
 
 
 @lru_cache(maxsize=1024)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import read_parameters
 from switchfit.engine.corners.branch_functions import trace_for_numpy
@@ -21,7 +22,6 @@ from switchfit.engine.corners.path import BranchPath
 from switchfit.problem.corners.branches import Corners, Sides, find_corners
 from switchfit.problem.functions import Function
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import NotIntegrableError
 
 MOST_SLIDING, MOST_STEEP = 6, 2

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.corners.branches import Sides
-from switchfit.problem.validation.arrays import FloatArray
 
 
 class BranchPath(NamedTuple):

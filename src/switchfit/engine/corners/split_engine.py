@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive.integrator import SolveSettings
@@ -38,7 +39,6 @@ from switchfit.engine.run import Run
 from switchfit.engine.simulation import Costates, Simulation, Tangents
 from switchfit.problem.corners.branches import Corners, Sides
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import NotIntegrableError
 
 CROSSING_ITERATIONS, STEADY_ITERATIONS = 40, 8

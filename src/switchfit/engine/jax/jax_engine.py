@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh, MeshRows, build_rows
 from switchfit.discretization.signals import Piece
@@ -28,7 +29,6 @@ from switchfit.engine.simulation import Costates, Simulation, Tangents, finish_s
 from switchfit.problem.functions import use_float64
 from switchfit.problem.padding import pad_length
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.cache import use_compilation_cache
 
 

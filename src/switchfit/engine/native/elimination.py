@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.discretization.rows import FloatArray, couple
+from switchfit.arrays import FloatArray
+from switchfit.discretization.rows import couple
 from switchfit.engine.native.llvm.routines import count_doubles
 from switchfit.engine.native.scalars.graph import Graph, Node, Objects, as_objects
 from switchfit.engine.native.tracing.entries import known_number

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.evaluation import DenseEvaluation, Engine, Matrix
@@ -19,7 +20,6 @@ from switchfit.engine.native.program import second_order
 from switchfit.engine.native.sizes import Order
 from switchfit.engine.simulation import Costates, Simulation, Tangents, finish_simulation
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 
 Found = TypeVar("Found")
 ORDERS: dict[Matrix, Order] = {"exact": Order.HESSIAN, "gauss-newton": Order.GAUSS_NEWTON, "none": Order.GRADIENT}

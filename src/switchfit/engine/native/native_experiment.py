@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments, count_samples
 from switchfit.discretization.model import read_parameters
 from switchfit.engine.evaluation import DenseEvaluation, Evaluation
@@ -20,7 +21,6 @@ from switchfit.engine.native.scalars.graph import CHECKED
 from switchfit.engine.native.sizes import Order, Sizes, constants_of
 from switchfit.engine.simulation import Simulation, Tangents
 from switchfit.problem.structure import Structure
-from switchfit.problem.validation.arrays import FloatArray
 
 
 def native_experiment(

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments, count_samples
 from switchfit.engine.hypotheses import Column, Hypotheses, HypothesisLimits, HypothesisTolerances
 from switchfit.engine.native import program_cache
@@ -22,7 +23,6 @@ from switchfit.engine.native.hypothesis_memory import (
 from switchfit.engine.native.layout import get_address
 from switchfit.engine.native.llvm.compilation import Program
 from switchfit.engine.native.sizes import Order, Sizes, constants_of
-from switchfit.problem.validation.arrays import FloatArray
 
 Integers = NDArray[np.int64]
 

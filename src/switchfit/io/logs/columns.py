@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs.log import FloatArray, Log
+from switchfit.arrays import FloatArray
+from switchfit.io.logs.log import Log
 from switchfit.io.logs.options import Options
 from switchfit.io.logs.refusals import refuse_without_times
 from switchfit.io.logs.units import normalize_time_unit, split_unit

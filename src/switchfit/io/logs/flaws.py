@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.io.logs.log import FloatArray, Log
+from switchfit.arrays import FloatArray
+from switchfit.io.logs.log import Log
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.issue import Issue

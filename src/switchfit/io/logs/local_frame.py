@@ -12,7 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from switchfit.io.logs.log import FloatArray, Log
+from switchfit.arrays import FloatArray
+from switchfit.io.logs.log import Log
 from switchfit.problem.validation import arrays
 from switchfit.problem.validation.messages import shorten
 from switchfit.runtime.errors import InputError

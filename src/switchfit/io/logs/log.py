@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.dates import Dates
 from switchfit.problem.time_units import SECONDS_OF_UNIT
 from switchfit.problem.validation.messages import join_names, shorten
@@ -17,8 +18,6 @@ from switchfit.runtime.errors import InputError
 from switchfit.runtime.frames import Column, Frame, build_pandas
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_line, join_first
-
-FloatArray = NDArray[np.float64]
 
 
 class Event(NamedTuple):
@@ -87,7 +86,6 @@ class Log:
     Examples
     --------
     >>> from pathlib import Path
-    >>> import switchfit as sf
     >>> _ = Path("drive.csv").write_text("t [ms];x [m];mode\\n0;1.5;push\\n20;1.6;push\\n40;1.8;brake\\n")
     >>> log = sf.read_log("drive.csv")
     >>> log.channels, log["x"], log.time_unit
@@ -198,7 +196,6 @@ class Log:
         Examples
         --------
         >>> from pathlib import Path
-        >>> import switchfit as sf
         >>> _ = Path("drive.csv").write_text("Time;Position along X\\ns;m\\nt;x\\n0;1.5\\n1;1.6\\n")
         >>> sf.read_log("drive.csv").find_channel("Position along X")
         'x'
@@ -220,7 +217,6 @@ class Log:
         Examples
         --------
         >>> from pathlib import Path
-        >>> import switchfit as sf
         >>> _ = Path("drive.csv").write_text("t [s],x [m]\\n0,1.5\\n1,1.6\\n")
         >>> table = sf.read_log("drive.csv").to_pandas()
         >>> table["x"].tolist(), table.index.name, table.attrs["units"]

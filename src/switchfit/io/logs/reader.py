@@ -94,7 +94,6 @@ def read_log(
     Examples
     --------
     >>> from pathlib import Path
-    >>> import switchfit as sf
     >>> _ = Path("drive.csv").write_text("Zeit;Weg;\\nms;m;\\n0;0,00;\\n20;0,05;\\n40;0,10;\\n", encoding="latin-1")
     >>> log = sf.read_log("drive.csv", time_unit="s")
     >>> log.times, log["Weg"], log.units["Weg"]

@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.io.logs.cells import CLOCK_TIME, is_date, is_missing, read_clock_cell, read_date_cell
 from switchfit.io.logs.columns import build_log, find_time_name
 from switchfit.io.logs.local_frame import FRAME_CHANNELS, find_position
@@ -19,7 +20,6 @@ from switchfit.io.logs.log import Event, Log
 from switchfit.io.logs.options import Options
 from switchfit.io.logs.refusals import refuse_without_times
 from switchfit.io.logs.text_table import LONG_INTEGER, TextTable, read_table
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.issue import Issue

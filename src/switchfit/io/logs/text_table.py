@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.io.logs.cells import DECIMAL_NUMBER, parse_number
 from switchfit.io.logs.decoding import decode
 from switchfit.io.logs.header import NumberedRow, find_delimiter, read_header, split_lines
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import InputError
 
 SNIFFED = 100

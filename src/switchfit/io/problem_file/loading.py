@@ -65,7 +65,6 @@ def load_problem(
     --------
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>> import switchfit as sf
     >>> from switchfit.io.problem_file.writing import write_first_problem
     >>> from switchfit.io.problem_file import load_problem
 

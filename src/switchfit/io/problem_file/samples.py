@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.units import normalize_time_unit
 from switchfit.io.problem_file.logs import list_value_columns
@@ -12,7 +13,6 @@ from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTabl
 from switchfit.problem.dates import Dates, as_date
 from switchfit.problem.origin import make_origin
 from switchfit.problem.time_units import SECONDS_OF_UNIT
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.runtime.errors import InputError
 
 

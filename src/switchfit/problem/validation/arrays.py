@@ -18,13 +18,12 @@ from decimal import Decimal
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.problem.validation.messages import shorten
 from switchfit.problem.validation.precision import is_low_precision, refuse_single_precision
 from switchfit.problem.validation.tables import is_of_library, list_columns
 
-FloatArray = NDArray[np.float64]
 ARRAY = "a number or an array of numbers"
 LARGEST_COUNT = 10**9
 LARGEST_SEED = 2**64 - 1

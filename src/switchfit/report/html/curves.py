@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, find_delay
-from switchfit.problem.validation.arrays import FloatArray
 from switchfit.report.fit_figure import has_bands
 from switchfit.report.numbers import format_unit, get_unit
 from switchfit.report.panels import replace_infinities
