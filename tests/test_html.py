@@ -312,8 +312,8 @@ def test_many_runs_stay_small_and_the_worst_come_first():
     fit = sf.estimate(sf.Problem(RAMP, ramps(45), {"v": 0.9}), strategy="local")
     text = format_page(fit)
     reader, payload = check_alone(text), payload_of(text)
-    assert len(payload["runs"]) == pages.MOST_RUNS
-    assert f"The {pages.MOST_RUNS} of 45 runs that are explained worst" in reader.words
+    assert len(payload["runs"]) == pages.MOST_RUNS_IN_PAGE
+    assert f"The {pages.MOST_RUNS_IN_PAGE} of 45 runs that are explained worst" in reader.words
     assert re.findall(r'<option value="\d+">\s*(\S+):', text)[0] == fit.run_names[-1]
     assert len([name for name in payload["templates"] if name.startswith("run-")]) == 1, "all runs share a drawing"
     assert len(text) < 2_500_000

@@ -15,8 +15,7 @@ from systems import P0, case
 import switchfit as sf
 from switchfit.discretization.row_errors import measure_jump
 from switchfit.discretization.tableaus import STIFF, STIFF_BEND
-from switchfit.engine import adaptive
-from switchfit.engine.adaptive import step_times
+from switchfit.engine.adaptive import integrator, step_times
 from switchfit.engine.choice import derivatives_inside_program
 from switchfit.engine.native import elimination, kernels
 from switchfit.engine.native.library_places import places_in_library
@@ -444,5 +443,5 @@ def test_adaptive_steps_are_about_as_many_as_those_of_scipy(name, monkeypatch):
     problem = PROBLEMS[name](engine="native")
     (run,), theta = runs_of(problem), problem.initial_theta
     own = len(step_times.solve_adaptively(run, theta))
-    monkeypatch.setattr(adaptive, "native_experiment", lambda *_, **__: None)
+    monkeypatch.setattr(integrator, "native_experiment", lambda *_, **__: None)
     assert own / 1.2 < len(step_times.solve_adaptively(run, theta)) < 1.5 * own
