@@ -36,7 +36,7 @@ def make_convex_on_face(scaled: FloatArray, normals: FloatArray, make_definite: 
     # H + sigma N'N is H on the face, and positive definite for a large sigma if and only if H is there ([1]_, 17.4).
     for stiffness in STIFFENINGS if len(normals) else ():
         stiff = scaled + stiffness * across
-        if positive_definite.has_curvature(stiff):
+        if has_curvature(stiff):
             return stiff
     return make_definite(scaled)
 

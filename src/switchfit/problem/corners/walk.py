@@ -123,7 +123,6 @@ class CornerWalk(Walk):
         return [self._list_names(shape, ((what, whole, i, k) for k in count())) for i, shape in outs]
 
     def apply(self, equation: Any, given: list[_Value], origin: Any) -> list[_Value]:
-        """Return the results of an operation on the given sides."""
         """Return the results of one operation, and register the corners that it makes."""
         name, params, names = equation.primitive.name, equation.params, self._name(equation, given)
         depends = [each.moves for each in given]
