@@ -48,7 +48,7 @@ from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.presentation import format_line, join_first
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
-METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
+METHODS: tuple[Method, ...] = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
 ITERATIONS = 60
 
 #: After a Newton step below this part of a transition time, its error is rounding.

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from switchfit.arrays import Traced
 from switchfit.problem.validation.messages import join_names
 from switchfit.problem.validation.names import as_sequence
 
 
-def check_modes(modes: Any, known: Iterable[str]) -> tuple[str, ...]:
+def check_modes(modes: object, known: Iterable[str]) -> tuple[str, ...]:
     """Return the names of the modes that a system shall have.
 
     Parameters
@@ -29,13 +30,13 @@ def check_modes(modes: Any, known: Iterable[str]) -> tuple[str, ...]:
     """
     form = f"a sequence of names out of {', '.join(known)}"
     names = (modes,) if isinstance(modes, str) else as_sequence(modes, "modes", form)
-    valid = {name for name in names if isinstance(name, str)}.intersection(known)
-    if not names or len(valid) < len(names):
+    valid = [name for name in names if isinstance(name, str) and name in set(known)]
+    if not names or len(set(valid)) < len(names):
         raise ValueError(f"modes must be different ones of {', '.join(known)}; got {join_names(names)}.")
-    return names
+    return tuple(valid)
 
 
-def check_length(initial_state: Any, states: Sequence[str]) -> Any:
+def check_length(initial_state: Any, states: Sequence[str]) -> Traced:
     """Return an initial state that has one entry for each state; a function of p is checked where it is called.
 
     Parameters
@@ -56,7 +57,7 @@ def check_length(initial_state: Any, states: Sequence[str]) -> Any:
     return initial_state
 
 
-def read_input(u: Any, channels: Sequence[str]) -> tuple[Any, ...]:
+def read_input(u: Traced, channels: Sequence[str]) -> tuple[Traced, ...]:
     """Return the channels of the input at one time.
 
     JAX clips an index that is too large instead of failing: too few channels would be taken for the last one.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import Traced
 from switchfit.models.arguments import check_length, check_modes, read_input
 from switchfit.models.constants import Constant, Values, check_constants
 from switchfit.problem.system import HybridSystem
@@ -120,7 +120,9 @@ def bicycle(
     )
 
 
-def _steer(sliding: tuple[bool, bool], constants: dict[str, Constant], t: Any, x: Any, p: Any, u: Any) -> Any:
+def _steer(
+    sliding: tuple[bool, bool], constants: dict[str, Constant], t: Traced, x: Traced, p: Mapping[str, Traced], u: Traced
+) -> Traced:
     front_slides, rear_slides = sliding
     _, _, theta, v_x, v_y, r = x
     delta, F_x = read_input(u, STEERING)

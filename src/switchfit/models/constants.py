@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
+from switchfit.arrays import Traced
 from switchfit.problem.validation.arrays import as_finite, as_not_negative, as_positive
 
 Constant = float | str
@@ -16,9 +16,9 @@ Constants = Mapping[str, Constant]
 
 def check_constants(
     *,
-    positive: Mapping[str, Any],
-    not_negative: Mapping[str, Any] | None = None,
-    others: Mapping[str, Any] | None = None,
+    positive: Mapping[str, object],
+    not_negative: Mapping[str, object] | None = None,
+    others: Mapping[str, object] | None = None,
 ) -> dict[str, Constant]:
     """Return constants as floats and names.
 
@@ -60,10 +60,10 @@ class Values:
         The parameters that a mode gets.
     """
 
-    def __init__(self, constants: Constants, p: Mapping[str, Any]) -> None:
+    def __init__(self, constants: Constants, p: Mapping[str, Traced]) -> None:
         self._constants, self._p = constants, p
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> Traced:
         """Return the value of a constant."""
         value = self._constants[name]
         return self._p[value] if isinstance(value, str) else value

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import Traced
 from switchfit.models.arguments import check_length, check_modes, read_input
 from switchfit.models.constants import Constant, Constants, Values, check_constants, is_absent
 from switchfit.problem.system import HybridSystem
@@ -143,16 +144,25 @@ def differential_drive(
     )
 
 
-def _until(constants: Constants, t: Any, x: Any, p: Any) -> Any:
+def _until(constants: Constants, t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     return t - Values(constants, p)["delay"]
 
 
-def _magnitude(V: Any) -> Any:
+def _magnitude(V: Traced) -> Traced:
     """Return |V|, rounded off at LOW_SPEED."""
     return jnp.sqrt(V * V + LOW_SPEED**2)
 
 
-def _move(slips: bool, commanded: bool, waits: bool, constants: Constants, t: Any, x: Any, p: Any, u: Any) -> Any:
+def _move(
+    slips: bool,
+    commanded: bool,
+    waits: bool,
+    constants: Constants,
+    t: Traced,
+    x: Traced,
+    p: Mapping[str, Traced],
+    u: Traced,
+) -> Traced:
     """Return dx/dt; where the wheels wait they keep their speeds."""
     theta, c = x[2], Values(constants, p)
     given = read_input(u, SPEEDS)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 
+from switchfit.arrays import Traced
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.parameter import Parameter
@@ -50,15 +51,15 @@ def heater_problem() -> Problem:
     return Problem(system, Experiment(log, ("on", "off"), (2.0,), 0.0, 6.0, time_unit="h"), parameters)
 
 
-def _on(t: Any, x: Any, p: Any) -> Any:
+def _on(t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     return p["power"] - p["k"] * x
 
 
-def _off(t: Any, x: Any, p: Any) -> Any:
+def _off(t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     return -p["k"] * x
 
 
-def _temperature(times: Any) -> Any:
+def _temperature(times: Traced) -> Traced:
     """Return the closed form of the solution with `OFF` and `LOSS`."""
     on = np.minimum(times, OFF)
     return 10.0 / LOSS * (1.0 - np.exp(-LOSS * on)) * np.exp(-LOSS * (times - on))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import Traced
 from switchfit.models.arguments import check_length, read_input
 from switchfit.models.constants import Constant, Constants, Values, check_constants
 from switchfit.problem.system import HybridSystem
@@ -93,11 +94,11 @@ def lugre(
     )
 
 
-def _get_speed(t: Any, x: Any, p: Any) -> Any:
+def _get_speed(t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     return x[1]
 
 
-def _bend(constants: Constants, direction: int, t: Any, x: Any, p: Any, u: Any) -> Any:
+def _bend(constants: Constants, direction: int, t: Traced, x: Traced, p: Mapping[str, Traced], u: Traced) -> Traced:
     position, v, z = x
     c = Values(constants, p)
     level = c["F_c"] + (c["F_s"] - c["F_c"]) * jnp.exp(-((v / c["v_s"]) ** 2))  # G(v)

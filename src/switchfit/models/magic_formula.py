@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import Traced
 from switchfit.models.arguments import check_length, read_input
 from switchfit.models.constants import Constant, Constants, Values, check_constants, is_absent
 from switchfit.models.skid_steer import SKID_STEER_STATES, SKID_STEER_UNITS
@@ -131,7 +132,7 @@ def magic_formula(
     return HybridSystem({"drive": drive}, start, state_names=names, state_units=units)
 
 
-def _drive(constants: Constants, aligning: bool, t: Any, x: Any, p: Any, u: Any) -> Any:
+def _drive(constants: Constants, aligning: bool, t: Traced, x: Traced, p: Mapping[str, Traced], u: Traced) -> Traced:
     c = Values(constants, p)
     a, b, height = c["a"], c["b"], c["height"]
     m = c["m_b"] + 4 * c["m_w"]
@@ -140,7 +141,7 @@ def _drive(constants: Constants, aligning: bool, t: Any, x: Any, p: Any, u: Any)
     ahead = a * np.array([1.0, 1.0, -1.0, -1.0])  # wheels 1 and 2 in front,
     left = b * np.array([-1.0, 1.0, 1.0, -1.0])  # 2 and 3 on the left
 
-    def loads(acceleration: Any) -> Any:
+    def loads(acceleration: Traced) -> Traced:
         load = static - 1e-3 * m * height / 4 * (acceleration[0] * ahead / a**2 + acceleration[1] * left / b**2)
         least = LEAST_LOAD * static
         return least + 0.5 * (load - least + jnp.sqrt((load - least) ** 2 + least**2))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import jax.numpy as jnp
 
+from switchfit.arrays import Traced
 from switchfit.models.constants import Constant, Constants, Values, check_constants, is_absent
 from switchfit.problem.system import HybridSystem
 
@@ -94,18 +95,18 @@ def rolling_body(
     )
 
 
-def _start_body(p: Any) -> Any:
+def _start_body(p: Mapping[str, Traced]) -> Traced:
     return jnp.stack([0.0 * p["v_0"], p["v_0"], p["omega_0"]])
 
 
-def _slope(constants: Constants, c: Values) -> tuple[Any, Any]:
+def _slope(constants: Constants, c: Values) -> tuple[Traced, Traced]:
     """Return the cosine and the sine of the slope."""
     if is_absent(constants["slope"]):
         return 1.0, 0.0
     return jnp.cos(c["slope"]), jnp.sin(c["slope"])
 
 
-def _slide(constants: Constants, direction: int, t: Any, x: Any, p: Any) -> Any:
+def _slide(constants: Constants, direction: int, t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     c = Values(constants, p)
     cos, sin = _slope(constants, c)
     friction = direction * c["mu"] * c["g"] * cos
@@ -113,12 +114,12 @@ def _slide(constants: Constants, direction: int, t: Any, x: Any, p: Any) -> Any:
     return jnp.stack([x[1], dv + 0.0 * x[1], friction / (c["inertia"] * c["radius"]) + 0.0 * x[1]])
 
 
-def _roll(constants: Constants, t: Any, x: Any, p: Any) -> Any:
+def _roll(constants: Constants, t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     c = Values(constants, p)
     cos, sin = _slope(constants, c)
     dv = -c["g"] * (sin + c["rolling"] * cos) / (1 + c["inertia"])
     return jnp.stack([x[1], dv + 0.0 * x[1], dv / c["radius"] + 0.0 * x[1]])
 
 
-def _get_slip(constants: Constants, t: Any, x: Any, p: Any) -> Any:
+def _get_slip(constants: Constants, t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     return x[1] - Values(constants, p)["radius"] * x[2]

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import permutations
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.arrays import Traced
 from switchfit.models.arguments import check_length, check_modes, read_input
 from switchfit.models.constants import Constant, Constants, Values, check_constants, is_absent
-from switchfit.problem.system import HybridSystem
+from switchfit.problem.system import HybridSystem, VectorField
 from switchfit.problem.validation.arrays import as_finite
 from switchfit.problem.validation.messages import shorten
 from switchfit.problem.validation.names import as_choice
@@ -174,7 +175,7 @@ def skid_steer(
     )  # fmt: skip
     fields, resets = {}, {}
     for name in names:
-        field: Any = _move_by_input if forces is None else partial(_move, forces[0 if name == "stick" else 1])
+        field: VectorField = _move_by_input if forces is None else partial(_move, forces[0 if name == "stick" else 1])
         fields[name] = partial(field, STUCK_AXLES[name], constants)
     if restick == "reset":
         resets = {
@@ -200,7 +201,7 @@ def _check_modes(modes: Sequence[str], restick: str) -> tuple[str, ...]:
     return names
 
 
-def _check_forces(from_input: bool, **given: Any) -> list[tuple[float, ...]] | None:
+def _check_forces(from_input: bool, **given: Sequence[float] | None) -> list[tuple[float, ...]] | None:
     """Return the driving forces of the wheels in stick and in all other modes; None if they are the input."""
     if as_flag(from_input, "forces_from_input"):
         for name, forces in given.items():
@@ -216,11 +217,20 @@ def _check_forces(from_input: bool, **given: Any) -> list[tuple[float, ...]] | N
     return found
 
 
-def _move_by_input(stuck: tuple[int, ...], constants: Constants, t: Any, x: Any, p: Any, u: Any) -> Any:
+def _move_by_input(
+    stuck: tuple[int, ...], constants: Constants, t: Traced, x: Traced, p: Mapping[str, Traced], u: Traced
+) -> Traced:
     return _move(read_input(u, FORCES), stuck, constants, t, x, p)
 
 
-def _move(forces: tuple[Any, ...], stuck: tuple[int, ...], constants: Constants, t: Any, x: Any, p: Any) -> Any:
+def _move(
+    forces: tuple[Traced, ...],
+    stuck: tuple[int, ...],
+    constants: Constants,
+    t: Traced,
+    x: Traced,
+    p: Mapping[str, Traced],
+) -> Traced:
     """Return dx/dt with driving forces (4,) where some axles do not move sideways."""
     _, dX, _, dY, theta, dtheta = x
     c = Values(constants, p)
@@ -271,7 +281,7 @@ def _move(forces: tuple[Any, ...], stuck: tuple[int, ...], constants: Constants,
     return jnp.stack([dX, ddX, dY, ddY, dtheta, ddtheta])
 
 
-def _stop_axles(stuck: tuple[int, ...], constants: Constants, t: Any, x: Any, p: Any) -> Any:
+def _stop_axles(stuck: tuple[int, ...], constants: Constants, t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     """Return the state after impulses at one axle or both that stop their lateral motion."""
     X, dX, Y, dY, theta, dtheta = x
     cos, sin = jnp.cos(theta), jnp.sin(theta)
@@ -288,7 +298,7 @@ def _stop_axles(stuck: tuple[int, ...], constants: Constants, t: Any, x: Any, p:
     return jnp.stack([X, along * cos - across * sin, Y, along * sin + across * cos, theta, turn])
 
 
-def _masses(c: Values) -> tuple[Any, Any]:
+def _masses(c: Values) -> tuple[Traced, Traced]:
     """Return the mass, and twelve times the moment of inertia, as in (18)."""
     m = c["m_b"] + 4 * c["m_w"]
     return m, 4 * c["m_w"] * (12 * c["a"] ** 2 + 12 * c["b"] ** 2) + c["m_b"] * (c["B_l"] ** 2 + c["B_w"] ** 2)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import jax.numpy as jnp
 
+from switchfit.arrays import Traced
 from switchfit.models.constants import Constant, Constants, Values, check_constants
 from switchfit.problem.system import HybridSystem
 
@@ -65,15 +66,15 @@ def sliding_block(*, g: Constant = 9.81) -> HybridSystem:
     )
 
 
-def _brake(constants: Constants, t: Any, x: Any, p: Any) -> Any:
+def _brake(constants: Constants, t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     speed = jnp.sqrt(p["vx0"] ** 2 + p["vy0"] ** 2)
     deceleration = p["mu"] * Values(constants, p)["g"] / speed
     return jnp.stack([x[2], x[3], -deceleration * p["vx0"], -deceleration * p["vy0"]])
 
 
-def _keep_velocity(t: Any, x: Any, p: Any) -> Any:
+def _keep_velocity(t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     return jnp.zeros_like(x)
 
 
-def _start_block(p: Any) -> Any:
+def _start_block(p: Mapping[str, Traced]) -> Traced:
     return jnp.stack([p["x0"], p["y0"], p["vx0"], p["vy0"]])

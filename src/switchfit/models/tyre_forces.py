@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+from switchfit.arrays import Traced
 
 #: Coefficients a_1 to a_8 of the longitudinal (x) and the lateral (y) force of 1987, by the parameter's name.
 MAGIC_FORMULA: Mapping[str, float] = MappingProxyType(
@@ -27,7 +28,7 @@ ALIGNING_MOMENT: Mapping[str, float] = MappingProxyType(
 C_X, C_Y, C_Z = 1.65, 1.30, 2.40
 
 
-def longitudinal_force(slip: Any, load: Any, p: Mapping[str, Any]) -> Any:
+def longitudinal_force(slip: Traced, load: Traced, p: Mapping[str, Traced]) -> Traced:
     """Return the longitudinal force of a tyre (N) at a slip ratio in % and a load in kN; `p` holds a_x1 to a_x8."""
     a_1, a_2, a_3, a_4, a_5, a_6, a_7, a_8 = (p[f"a_x{i}"] for i in range(1, 9))
     peak = a_1 * load + a_2  # D / load; that D and BCD have load as a factor saves operations
@@ -36,7 +37,7 @@ def longitudinal_force(slip: Any, load: Any, p: Mapping[str, Any]) -> Any:
     return _magic_formula(slip, B, C_X, peak * load, E)
 
 
-def lateral_force(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
+def lateral_force(angle: Traced, load: Traced, p: Mapping[str, Traced]) -> Traced:
     """Return the lateral force of a tyre (N) at a slip angle in degrees and a load in kN; `p` holds a_y1 to a_y8."""
     a_1, a_2, a_3, a_4, a_5, a_6, a_7, a_8 = (p[f"a_y{i}"] for i in range(1, 9))
     D = (a_1 * load + a_2) * load
@@ -45,7 +46,7 @@ def lateral_force(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
     return _magic_formula(angle, BCD / (C_Y * D), C_Y, D, E)
 
 
-def compute_aligning_moment(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
+def compute_aligning_moment(angle: Traced, load: Traced, p: Mapping[str, Traced]) -> Traced:
     """Return the aligning moment of a tyre (N m) at a slip angle in degrees and a load in kN, from a_z1 to a_z8."""
     a_1, a_2, a_3, a_4, a_5, a_6, a_7, a_8 = (p[f"a_z{i}"] for i in range(1, 9))
     D = a_1 * load**2 + a_2 * load
@@ -54,7 +55,7 @@ def compute_aligning_moment(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
     return _magic_formula(angle, BCD / (C_Z * D), C_Z, D, E)
 
 
-def _magic_formula(X: Any, B: Any, C: float, D: Any, E: Any) -> Any:
+def _magic_formula(X: Traced, B: Traced, C: float, D: Traced, E: Traced) -> Traced:
     """Y = D sin(C atan(B phi)), phi = (1 − E) X + (E/B) atan(B X); the shifts are zero."""
     return D * _curve(B * X, E, C)
 
@@ -64,19 +65,19 @@ def _magic_formula(X: Any, B: Any, C: float, D: Any, E: Any) -> Any:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _curve(x: Any, E: Any, C: float) -> Any:
+def _curve(x: Traced, E: Traced, C: float) -> Traced:
     """Return ``y = sin(C atan q)``, ``q = x + E (atan x - x)``; x is B X, and q is B phi."""
     return jnp.sin(C * jnp.arctan(x + E * (jnp.arctan(x) - x)))
 
 
 @_curve.defjvp
-def _move_along_curve(C: float, at: tuple[Any, Any], moves: tuple[Any, Any]) -> tuple[Any, Any]:
+def _move_along_curve(C: float, at: tuple[Traced, Traced], moves: tuple[Traced, Traced]) -> tuple[Traced, Traced]:
     y_x, y_E = _slopes(*at, C)
     return _curve(*at, C), y_x * moves[0] + y_E * moves[1]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _slopes(x: Any, E: Any, C: float) -> tuple[Any, Any]:
+def _slopes(x: Traced, E: Traced, C: float) -> tuple[Traced, Traced]:
     """Return dy/dx and dy/dE."""
     first, _ = _derive_sine(x, E, C)
     q_x, q_E = _derive_angle(x, E)
@@ -84,7 +85,7 @@ def _slopes(x: Any, E: Any, C: float) -> tuple[Any, Any]:
 
 
 @_slopes.defjvp
-def _move_slopes(C: float, at: tuple[Any, Any], moves: tuple[Any, Any]) -> tuple[Any, Any]:
+def _move_slopes(C: float, at: tuple[Traced, Traced], moves: tuple[Traced, Traced]) -> tuple[Traced, Traced]:
     x, E = at
     first, second = _derive_sine(x, E, C)
     q_x, q_E = _derive_angle(x, E)
@@ -94,12 +95,12 @@ def _move_slopes(C: float, at: tuple[Any, Any], moves: tuple[Any, Any]) -> tuple
     return _slopes(x, E, C), (y_xx * moves[0] + y_xE * moves[1], y_xE * moves[0] + y_EE * moves[1])
 
 
-def _derive_angle(x: Any, E: Any) -> tuple[Any, Any]:
+def _derive_angle(x: Traced, E: Traced) -> tuple[Traced, Traced]:
     """Return dq/dx and dq/dE."""
     return 1 - E * x**2 / (1 + x**2), jnp.arctan(x) - x
 
 
-def _derive_sine(x: Any, E: Any, C: float) -> tuple[Any, Any]:
+def _derive_sine(x: Traced, E: Traced, C: float) -> tuple[Traced, Traced]:
     """Return dy/dq and d²y/dq²."""
     q = x + E * (jnp.arctan(x) - x)
     angle, slope = C * jnp.arctan(q), C / (1 + q**2)

@@ -15,14 +15,18 @@ import operator
 from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from decimal import Decimal
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
 from switchfit.problem.validation.messages import shorten
 from switchfit.problem.validation.precision import is_low_precision, refuse_single_precision
 from switchfit.problem.validation.tables import is_of_library, list_columns
+
+Exact: TypeAlias = "ArrayLike | list[Exact]"
+"""What `numpy.array` converts to float64 without changing a number."""
 
 ARRAY = "a number or an array of numbers"
 LARGEST_COUNT = 10**9
@@ -42,14 +46,11 @@ TEXT_TYPES = (str, bytes, bytearray)
 _DATES = (datetime.date, datetime.time, datetime.timedelta)
 
 
-# --- numbers ----------------------------------------------------------------------------------------------------------
-
-
 class _WrongEntryError(Exception):
     """An entry of an argument is not a number: the entry, the type of the error to raise, and why."""
 
 
-def as_array(value: Any, what: str, *, form: str = ARRAY, finite: bool = False) -> FloatArray:
+def as_array(value: object, what: str, *, form: str = ARRAY, finite: bool = False) -> FloatArray:
     """Return `value` as a new float64 array of any shape.
 
     Parameters
@@ -93,7 +94,7 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, finite: bool = False) 
     return array
 
 
-def as_number(value: Any, what: str) -> float:
+def as_number(value: object, what: str) -> float:
     """Return `value` as a float; NaN and infinities are allowed."""
     if type(value) is float:
         return value
@@ -103,7 +104,7 @@ def as_number(value: Any, what: str) -> float:
     return float(number.item())
 
 
-def as_finite(value: Any, what: str) -> float:
+def as_finite(value: object, what: str) -> float:
     """Return `value` as a finite float."""
     number = as_number(value, what)
     if not math.isfinite(number):
@@ -111,7 +112,7 @@ def as_finite(value: Any, what: str) -> float:
     return number
 
 
-def as_positive(value: Any, what: str) -> float:
+def as_positive(value: object, what: str) -> float:
     """Return `value` as a positive, finite float."""
     number = as_number(value, what)
     if not number > 0:
@@ -119,7 +120,7 @@ def as_positive(value: Any, what: str) -> float:
     return as_finite(number, what)
 
 
-def as_not_negative(value: Any, what: str) -> float:
+def as_not_negative(value: object, what: str) -> float:
     """Return `value` as a finite float that is 0 or more."""
     number = as_finite(value, what)
     if number < 0:
@@ -134,7 +135,7 @@ def require_deviation(sd: FloatArray, what: str) -> None:
             raise ValueError(f"{what} must be positive and finite, and so must its inverse square; got {sd.min()}.")
 
 
-def as_level(value: Any) -> float:
+def as_level(value: object) -> float:
     """Return a confidence level as a float between 0 and 1."""
     number = as_number(value, "level")
     if not 0 < number < 1:
@@ -142,10 +143,10 @@ def as_level(value: Any) -> float:
     return number
 
 
-def as_count(value: Any, what: str, *, at_least: int = 0, at_most: int = LARGEST_COUNT) -> int:
+def as_count(value: object, what: str, *, at_least: int = 0, at_most: int = LARGEST_COUNT) -> int:
     """Return an integer of Python, NumPy or JAX as an int in the given range; floats are not accepted."""
     try:
-        count = None if isinstance(value, (bool, np.bool_)) else operator.index(value)
+        count = None if isinstance(value, (bool, np.bool_)) else operator.index(value)  # type: ignore[arg-type]
     except Exception:  # TypeError; JAX's tracers raise their own
         count = None
     if count is None or getattr(value, "dtype", None) == np.bool_:
@@ -158,12 +159,12 @@ def as_count(value: Any, what: str, *, at_least: int = 0, at_most: int = LARGEST
     return count
 
 
-def as_seed(value: Any) -> int:
+def as_seed(value: object) -> int:
     """Return the seed of a random number generator."""
     return as_count(value, "seed", at_most=LARGEST_SEED)
 
 
-def as_index(value: Any, what: str, size: int) -> int:
+def as_index(value: object, what: str, size: int) -> int:
     """Return an index from 0 to `size` - 1."""
     try:
         return as_count(value, what, at_most=size - 1)
@@ -171,7 +172,7 @@ def as_index(value: Any, what: str, size: int) -> int:
         raise ValueError(f"{what} must lie in 0..{size - 1}; got {shorten(value)}.") from None
 
 
-def _read_exactly(value: Any, what: str, depth: int = 0) -> Any:
+def _read_exactly(value: Any, what: str, depth: int = 0) -> Exact:
     """Return a number, an array or nested lists that `numpy.array` converts to float64 without changing a number."""
     if type(value) in _EXACT:
         return value
@@ -180,7 +181,7 @@ def _read_exactly(value: Any, what: str, depth: int = 0) -> Any:
     table = list_columns(value)
     if table is not None:  # its columns may differ in type
         columns = [_read_exactly(column, what, depth + 1) for _, column in table]
-        return np.stack(columns, axis=1) if columns else np.zeros((len(value), 0))
+        return np.stack([np.asarray(column) for column in columns], axis=1) if columns else np.zeros((len(value), 0))
     if hasattr(value, "__array__") and not isinstance(value, type):
         return _read_array_exactly(value, what, depth)
     if isinstance(value, Sequence) and not isinstance(value, (*TEXT_TYPES, memoryview)):
@@ -200,7 +201,7 @@ def _read_exactly(value: Any, what: str, depth: int = 0) -> Any:
     raise _WrongEntryError(value, ValueError if isinstance(value, TEXT_TYPES) else TypeError, why)
 
 
-def _read_array_exactly(value: Any, what: str, depth: int) -> Any:
+def _read_array_exactly(value: Any, what: str, depth: int) -> Exact:
     """Return an array, or another object with a dtype, as an array of integers or doubles."""
     if np.any(np.ma.getmask(value)):
         raise _WrongEntryError(

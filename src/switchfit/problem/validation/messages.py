@@ -31,16 +31,17 @@ def unit_suffix(unit: str) -> str:
     return "" if unit in ("", "1") else f" {unit}"
 
 
-def shorten(value: Any) -> str:
+def shorten(value: object) -> str:
     """Return any value as text for a message: at most `LONGEST_SHOWN_VALUE` characters."""
+    array: Any = value  # maybe, and of any library
     try:
-        is_small = hasattr(value, "tolist") and np.size(value) <= 8
-        text = " ".join(_SHORT.repr(value.tolist() if is_small else value).split())
+        is_small = hasattr(array, "tolist") and np.size(array) <= 8
+        text = " ".join(_SHORT.repr(array.tolist() if is_small else value).split())
     except Exception:  # a faulty __repr__
         text = f"an object of type {type(value).__name__}"
     return text if len(text) <= LONGEST_SHOWN_VALUE else f"{text[: LONGEST_SHOWN_VALUE - 3]}..."
 
 
-def join_names(names: Iterable[Any]) -> str:
+def join_names(names: Iterable[object]) -> str:
     """Return names with commas between them, the first ten if there are more; 'none' for no names."""
     return join_first((f"{name!s:.40}" for name in names), MOST_LISTED) or "none"

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from typing import Any
+from typing import TypeVar, overload
 
 from switchfit.problem.validation.arrays import TEXT_TYPES
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.tables import list_columns
 
+Choice = TypeVar("Choice", bound=str)
+Entry = TypeVar("Entry")
 
-def as_choice(value: Any, what: str, choices: Sequence[str]) -> Any:
+
+def as_choice(value: object, what: str, choices: Sequence[Choice]) -> Choice:
     """Return one of the strings `choices`."""
     if isinstance(value, str) and value in choices:
         return choices[choices.index(value)]
@@ -21,7 +24,7 @@ def as_choice(value: Any, what: str, choices: Sequence[str]) -> Any:
     raise error(f"{what} must be {wanted}; got {shorten(value)}.")
 
 
-def as_name(value: Any, what: str, form: str = "a string", *, empty: bool = False) -> str:
+def as_name(value: object, what: str, form: str = "a string", *, empty: bool = False) -> str:
     """Return a string, which must not be empty unless that is allowed."""
     if not isinstance(value, str):
         raise TypeError(f"{what} must be {form}; got {shorten(value)}.")
@@ -30,7 +33,7 @@ def as_name(value: Any, what: str, form: str = "a string", *, empty: bool = Fals
     return str(value)
 
 
-def as_names(value: Any, what: str, form: str) -> tuple[str, ...]:
+def as_names(value: object, what: str, form: str) -> tuple[str, ...]:
     """Return a sequence of strings that are not empty and differ from each other."""
     names = tuple(as_name(name, what, form) for name in as_sequence(value, what, form))
     if len(set(names)) < len(names):
@@ -39,14 +42,14 @@ def as_names(value: Any, what: str, form: str) -> tuple[str, ...]:
     return names
 
 
-def require_known(names: Iterable[Any], what: str, known: Iterable[str]) -> None:
+def require_known(names: Iterable[object], what: str, known: Collection[str]) -> None:
     """Raise ValueError if one of several names is not that of a mode."""
     for name in names:
         if name not in known:
             raise ValueError(f"{what} names the unknown mode {shorten(name)}; the modes are {join_names(known)}.")
 
 
-def as_labels(value: Any, what: str, each: str, count: int | None = None) -> tuple[str, ...] | None:
+def as_labels(value: object, what: str, each: str, count: int | None = None) -> tuple[str, ...] | None:
     """Return the names or the units of something, a string for each; None for None.
 
     Parameters
@@ -72,7 +75,7 @@ def as_labels(value: Any, what: str, each: str, count: int | None = None) -> tup
     return checked
 
 
-def as_named_columns(value: Any, what: str, form: str) -> dict[str, Any] | None:
+def as_named_columns(value: object, what: str, form: str) -> dict[str, object] | None:
     """Return the entries of a mapping, or of a table whose columns are all named by strings; else None.
 
     Raises
@@ -84,8 +87,8 @@ def as_named_columns(value: Any, what: str, form: str) -> dict[str, Any] | None:
     """
     table = list_columns(value)
     if table and all(isinstance(name, str) for name, _ in table):
-        as_names([name for name, _ in table], f"columns of {what}", "strings")
-        return dict(table)
+        names = as_names([name for name, _ in table], f"columns of {what}", "strings")
+        return dict(zip(names, (column for _, column in table), strict=True))
     if table is not None or not isinstance(value, Mapping):
         return None
     if not value:
@@ -93,7 +96,15 @@ def as_named_columns(value: Any, what: str, form: str) -> dict[str, Any] | None:
     return {as_name(name, f"names in {what}", "strings"): entry for name, entry in value.items()}
 
 
-def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
+@overload
+def as_sequence(value: Iterable[Entry], what: str, form: str) -> tuple[Entry, ...]: ...
+
+
+@overload
+def as_sequence(value: object, what: str, form: str) -> tuple[object, ...]: ...
+
+
+def as_sequence(value: object, what: str, form: str) -> tuple[object, ...]:
     """Return the entries of a list, a tuple, an array or another sequence.
 
     Raises
@@ -104,6 +115,6 @@ def as_sequence(value: Any, what: str, form: str) -> tuple[Any, ...]:
     if isinstance(value, (*TEXT_TYPES, AbstractSet, Mapping, Iterator)):
         raise TypeError(f"{what} must be {form}; got {shorten(value)}: give a list or a tuple.")
     try:
-        return tuple(value)
+        return tuple(value)  # type: ignore[arg-type]  # what cannot be iterated raises
     except Exception:  # TypeError; arrays without dimensions and others raise their own
         raise TypeError(f"{what} must be {form}; got {shorten(value)}.") from None

@@ -6,10 +6,11 @@ import inspect
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
+from switchfit.arrays import Traced
 from switchfit.problem.validation.messages import LONGEST_SHOWN_VALUE, shorten
 from switchfit.problem.validation.names import as_sequence
 
@@ -25,28 +26,28 @@ def set_fields(record: object, **values: object) -> None:
         object.__setattr__(record, name, value)
 
 
-def as_flag(value: Any, what: str) -> bool:
+def as_flag(value: object, what: str) -> bool:
     """Return a truth value of Python or NumPy as a bool; numbers are not accepted."""
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"{what} must be True or False; got {shorten(value)}.")
     return bool(value)
 
 
-def as_instance(value: Any, what: str, kind: type[T], form: str) -> T:
+def as_instance(value: object, what: str, kind: type[T], form: str) -> T:
     """Return `value` if it is an instance of `kind`; messages use `form` as its name."""
     if not isinstance(value, kind):
         raise TypeError(f"{what} must be {form}; got {type(value).__name__}.")
     return value
 
 
-def as_instances(value: Any, what: str, kind: type[T], form: str) -> tuple[T, ...]:
+def as_instances(value: object, what: str, kind: type[T], form: str) -> tuple[T, ...]:
     """Return an instance of `kind`, or a sequence of them, as a tuple; messages use `form` as the name of one."""
     form = f"{form} or a list of them"
     items = (value,) if isinstance(value, kind) else as_sequence(value, what, form)
     return tuple(as_instance(item, what, kind, form) for item in items)
 
 
-def as_callable(value: Any, what: str, form: str, *, arguments: int | None = None) -> Callable[..., Any]:
+def as_callable(value: object, what: str, form: str, *, arguments: int | None = None) -> Callable[..., Traced]:
     """Return a function, which must not be a class; messages use `form` as its name.
 
     Parameters
@@ -69,7 +70,7 @@ def as_callable(value: Any, what: str, form: str, *, arguments: int | None = Non
     return value
 
 
-def find_misfit(function: Callable[..., Any], arguments: Iterable[Any]) -> inspect.Signature | None:
+def find_misfit(function: Callable[..., object], arguments: Iterable[object]) -> inspect.Signature | None:
     """Return the signature of a function that cannot be called with some arguments; None if it can."""
     try:
         signature = inspect.signature(function)
@@ -82,7 +83,7 @@ def find_misfit(function: Callable[..., Any], arguments: Iterable[Any]) -> inspe
     return None
 
 
-def as_path(value: Any, what: str) -> Path:
+def as_path(value: object, what: str) -> Path:
     """Return a path that is not empty."""
     text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
     if not isinstance(text, str):

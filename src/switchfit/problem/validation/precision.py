@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import DTypeLike
 
 # --- single precision -------------------------------------------------------------------------------------------------
 
 
-def is_low_precision(dtype: Any) -> bool:
+def is_low_precision(dtype: DTypeLike) -> bool:
     """Return whether this is the dtype of floating-point numbers of less than double precision."""
     dtype = np.dtype(dtype)
     return dtype.itemsize < 8 and dtype.name.startswith(("float", "bfloat"))
 
 
-def refuse_single_precision(value: Any, what: str) -> None:
+def refuse_single_precision(value: object, what: str) -> None:
     """Raise if an array or a scalar of less than double precision has numbers that have lost digits.
 
     A number passes if it equals the double with its shortest decimal text, as 0.5 and 3.0 do. The text of

@@ -11,28 +11,29 @@ from typing import Any
 LIBRARIES = frozenset({"pandas", "polars", "xarray", "switchfit"})
 
 
-def is_of_library(value: Any, *names: str) -> bool:
+def is_of_library(value: object, *names: str) -> bool:
     """Return whether the class of an object, or one that it is derived from, is of one of the packages."""
     return any(kind.__module__.partition(".")[0] in names for kind in type(value).__mro__)
 
 
-def list_columns(value: Any) -> list[tuple[Any, Any]] | None:
+def list_columns(value: object) -> list[tuple[object, object]] | None:
     """Return (name, column) of each column of a table; None for anything else.
 
     Tables are DataFrames of pandas and polars, Datasets of xarray and logs.
     """
     if not is_of_library(value, *LIBRARIES):
         return None
-    if hasattr(value, "data_vars"):
-        return list(value.data_vars.items())
-    if not hasattr(value, "columns"):
+    table: Any = value  # of a library that is not imported here
+    if hasattr(table, "data_vars"):
+        return list(table.data_vars.items())
+    if not hasattr(table, "columns"):
         return None
-    if hasattr(value, "iloc"):  # in pandas, names may be anything, and stand there twice
-        return [(name, value.iloc[:, k]) for k, name in enumerate(value.columns)]
-    return [(name, value[name]) for name in value.columns]
+    if hasattr(table, "iloc"):  # in pandas, names may be anything, and stand there twice
+        return [(name, table.iloc[:, k]) for k, name in enumerate(table.columns)]
+    return [(name, table[name]) for name in table.columns]
 
 
-def find_labels(value: Any) -> tuple[tuple[str, ...] | None, tuple[str, ...] | None]:
+def find_labels(value: object) -> tuple[tuple[str, ...] | None, tuple[str, ...] | None]:
     """Return the names and the units of the columns of a table, or of the one column that it is.
 
     Names are None unless all are strings and differ; an array of xarray with labels along its second dimension has
@@ -43,7 +44,8 @@ def find_labels(value: Any) -> tuple[tuple[str, ...] | None, tuple[str, ...] | N
     if channels is None and is_of_library(value, *LIBRARIES):
         channels = [(getattr(value, "name", None), value)]
         if getattr(value, "ndim", 1) == 2:
-            channels = [(label.item(), value) for label in value.coords.get(value.dims[1], ())]
+            array: Any = value  # of xarray
+            channels = [(label.item(), array) for label in array.coords.get(array.dims[1], ())]
     channels = channels or []
     names = [name for name, _ in channels]
     proper = all(isinstance(name, str) and name.strip() for name in names) and len(set(names)) == len(names)
@@ -51,7 +53,7 @@ def find_labels(value: Any) -> tuple[tuple[str, ...] | None, tuple[str, ...] | N
     return tuple(map(str, names)) if names and proper else None, units if any(units) else None
 
 
-def _find_unit(value: Any, name: Any) -> str:
+def _find_unit(value: object, name: object) -> str:
     attributes = getattr(value, "attrs", None)
     units = attributes.get("units", "") if isinstance(attributes, Mapping) else ""
     unit = units.get(name, "") if isinstance(units, Mapping) else units
