@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import Parameter, as_parameter, require_time_unit
@@ -13,7 +12,7 @@ from switchfit.problem.validation.messages import join_names, shorten, unit_suff
 from switchfit.problem.validation.names import as_name, require_known
 
 
-def check_parameters(parameters: Any) -> dict[str, Parameter]:
+def check_parameters(parameters: object) -> dict[str, Parameter]:
     """Return the parameters of a problem by their names."""
     if not isinstance(parameters, Mapping | None):
         raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shorten(parameters)}.")
@@ -23,7 +22,7 @@ def check_parameters(parameters: Any) -> dict[str, Parameter]:
     }
 
 
-def check_durations(given: Any, system: HybridSystem) -> float | dict[str, float]:
+def check_durations(given: object, system: HybridSystem) -> float | dict[str, float]:
     """Return the shortest duration of all modes, or of each mode that a mapping names."""
     if not isinstance(given, Mapping):
         return as_not_negative(given, "min_duration")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
+from switchfit.arrays import Traced
 from switchfit.problem.validation.names import as_name
 from switchfit.problem.validation.objects import as_callable
 
@@ -30,7 +30,7 @@ class RunningCost:
     1
     """
 
-    ell: Callable[..., Any]
+    ell: Callable[..., Traced]
 
     def __post_init__(self) -> None:
         as_callable(self.ell, "RunningCost", "a function ell(t, x, p)")
@@ -56,7 +56,7 @@ class TerminalCost:
     1
     """
 
-    phi: Callable[..., Any]
+    phi: Callable[..., Traced]
 
     def __post_init__(self) -> None:
         as_callable(self.phi, "TerminalCost", "a function phi(x, p)")
@@ -86,7 +86,7 @@ class TransitionCost:
     >>> cost = sf.TransitionCost(lambda t, x, p: x[1] ** 2, before="push", after="brake")
     """
 
-    mu: Callable[..., Any]
+    mu: Callable[..., Traced]
     before: str | None = None
     after: str | None = None
 
@@ -119,7 +119,7 @@ class TerminalConstraint:
     2
     """
 
-    psi: Callable[..., Any]
+    psi: Callable[..., Traced]
 
     def __post_init__(self) -> None:
         as_callable(self.psi, "TerminalConstraint", "a function psi(x, p)")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any
 
+from switchfit.arrays import Converted
 from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost, TransitionCost
 from switchfit.problem.dates import Dates, list_dates
 from switchfit.problem.measurements import Measurements
@@ -14,7 +14,7 @@ from switchfit.problem.reference_signals import ReferenceSignal
 Data = Measurements | ReferenceSignal | RunningCost | TransitionCost | TerminalCost | TerminalConstraint
 
 
-def count_from(item: Any, origin: Origin, time_unit: str, what: str = "") -> Any:
+def count_from(item: Converted, origin: Origin, time_unit: str, what: str = "") -> Converted:
     """Return what an experiment is given, dates as numbers of a unit since the origin; anything else as it is.
 
     Parameters

@@ -14,11 +14,11 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from functools import lru_cache
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 from zoneinfo import ZoneInfo
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from switchfit.problem.time_units import SECONDS_OF_UNIT, TIME_UNITS
 from switchfit.problem.validation.arrays import as_array
@@ -35,6 +35,8 @@ FIRST_DAY, LAST_DAY = np.datetime64("0001-01-01"), np.datetime64("9999-12-31")
 """The days that a `datetime` may have."""
 
 _DATE_TYPES = (str, datetime.date, np.datetime64)  # a datetime and a Timestamp of pandas are dates too
+
+T = TypeVar("T")
 
 
 @lru_cache(maxsize=64)
@@ -80,7 +82,7 @@ def _split(date: datetime.datetime) -> tuple[np.datetime64, str]:
     return wall - np.timedelta64(offset, "us"), name or str(datetime.timezone(offset))[3:] or "UTC"
 
 
-def _name_tzinfo(tz: Any) -> str:
+def _name_tzinfo(tz: object) -> str:
     """Return the name of a zone in the IANA database, "" if it has none there."""
     name = getattr(tz, "key", None) or getattr(tz, "zone", None) or str(tz)
     try:
@@ -90,7 +92,7 @@ def _name_tzinfo(tz: Any) -> str:
     return str(name)
 
 
-def read_instant(value: Any, what: str, place: str = "") -> tuple[Any, str]:
+def read_instant(value: object, what: str, place: str = "") -> tuple[np.datetime64, str]:
     """Return the instant and the zone of one date; `place` says where it stands among several."""
     if isinstance(value, str):
         found = read_date_text(value)
@@ -101,7 +103,7 @@ def read_instant(value: Any, what: str, place: str = "") -> tuple[Any, str]:
     if value is None or str(value) in ("NaT", "<NA>", "nan"):
         _refuse_missing(what, place)
     if isinstance(value, np.datetime64):
-        return _as_instants(np.asarray(value), what)[()], ""
+        return _as_instants(np.asarray(value), what)[()], ""  # type: ignore[return-value]  # of shape ()
     if isinstance(value, datetime.datetime):
         return _split(value)
     if isinstance(value, datetime.date):
@@ -109,7 +111,7 @@ def read_instant(value: Any, what: str, place: str = "") -> tuple[Any, str]:
     raise TypeError(f"{what} must be numbers or dates, not both; got {shorten(value)}{place} among dates.")
 
 
-def _as_instants(array: NDArray[Any], what: str) -> Instants:
+def _as_instants(array: Instants, what: str) -> Instants:
     """Return datetime64 in microseconds, checked: NumPy would let them overflow."""
     missing = np.isnat(array)
     if missing.any():
@@ -158,7 +160,7 @@ class Dates:
     def __getitem__(self, index: Any) -> Dates:
         return Dates(np.asarray(self.instants[index]), self.time_zone)
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.generic]:
         """Return a datetime64 array, in UTC if the dates have a zone."""
         return self.instants if dtype is None else self.instants.astype(dtype)
 
@@ -190,15 +192,15 @@ class Dates:
         return Dates(self.instants - found, zone)
 
 
-def format_instant(instant: Any, zone: str) -> str:
+def format_instant(instant: Instants | np.datetime64, zone: str) -> str:
     """Return a date of `Dates.instants` in ISO 8601, in a zone or without one."""
-    date: datetime.datetime = instant.item()
+    date: datetime.datetime = instant.item()  # type: ignore[assignment]  # of microseconds
     if zone:
         date = date.replace(tzinfo=datetime.UTC).astimezone(find_zone(zone))
     return date.isoformat()
 
 
-def read_dates(value: Any, what: str) -> Dates | None:
+def read_dates(value: object, what: str) -> Dates | None:
     """Return dates, text, and arrays, columns of tables and lists of these as dates; None for anything else.
 
     Parameters
@@ -227,17 +229,18 @@ def read_dates(value: Any, what: str) -> Dates | None:
     tz = getattr(dtype, "tz", None) or getattr(dtype, "time_zone", None)  # of pandas, of polars
     if tz or is_of_library(value, "polars"):
         value = np.asarray(value, dtype="datetime64[us]" if tz else None)  # in UTC if it has a zone
-    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    column: Any = value  # of any library, or a list
+    kind = getattr(getattr(column, "dtype", None), "kind", "")
     if kind == "M":
         zone = tz if isinstance(tz, str) else _name_tzinfo(tz) or "UTC" if tz else ""
-        return Dates(_as_instants(np.asarray(value), what), zone)
-    is_list = isinstance(value, (list, tuple)) or (kind == "O" and getattr(value, "ndim", 1) == 1)
-    if kind == "U" or (is_list and any(issubclass(each, _DATE_TYPES) for each in set(map(type, value)))):
-        return _read_entries(list(value), what)
+        return Dates(_as_instants(np.asarray(column), what), zone)
+    is_list = isinstance(column, (list, tuple)) or (kind == "O" and getattr(column, "ndim", 1) == 1)
+    if kind == "U" or (is_list and any(issubclass(each, _DATE_TYPES) for each in set(map(type, column)))):
+        return _read_entries(list(column), what)
     return None
 
 
-def _read_entries(entries: list[Any], what: str) -> Dates:
+def _read_entries(entries: list[object], what: str) -> Dates:
     """Return entries, each a date or text, as dates."""
     pairs = [read_instant(entry, what, f" at index {index}") for index, entry in enumerate(entries)]
     zones = {zone for _, zone in pairs}
@@ -247,7 +250,7 @@ def _read_entries(entries: list[Any], what: str) -> Dates:
     return Dates(np.array([instant for instant, _ in pairs], dtype="datetime64[us]"), zone)
 
 
-def read_date(value: Any, what: str) -> Any:
+def read_date(value: T, what: str) -> T | Dates:
     """Return a single date as `Dates`, ValueError for several; anything else as it is."""
     date = read_dates(value, what)
     if date is not None and date.instants.shape != ():
@@ -255,7 +258,7 @@ def read_date(value: Any, what: str) -> Any:
     return value if date is None else date
 
 
-def as_date(value: Any, what: str) -> Dates:
+def as_date(value: object, what: str) -> Dates:
     """Return a single date; TypeError for anything else."""
     date = read_date(value, what)
     if not isinstance(date, Dates):
@@ -267,7 +270,7 @@ Given = tuple[str, Dates]
 """Dates among the arguments of an experiment, and what messages call them."""
 
 
-def list_dates(value: Any, what: str = "") -> Iterator[Given]:
+def list_dates(value: object, what: str = "") -> Iterator[Given]:
     """Yield all dates in a value, in the fields of dataclasses and in tuples, and what to call them."""
     if isinstance(value, Dates):
         yield what, value

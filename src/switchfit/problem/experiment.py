@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
-from typing import Any, get_args
+from typing import TypeVar, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import BoolArray, Converted, FloatArray, IntArray
 from switchfit.problem.data import Data, count_from
 from switchfit.problem.dates import list_dates, read_date, read_dates
 from switchfit.problem.inputs import Input
@@ -22,12 +21,15 @@ from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, require_time_unit
 from switchfit.problem.reference_signals import ReferenceSignal
 from switchfit.problem.signals import PiecewisePolynomial
-from switchfit.problem.system import HybridSystem, as_state
+from switchfit.problem.system import HybridSystem, InitialState, ResetMap, as_state
 from switchfit.problem.validation.arrays import as_number
 from switchfit.problem.validation.messages import join_names, shorten, unit_suffix
 from switchfit.problem.validation.names import as_name, as_sequence
 from switchfit.problem.validation.objects import as_instance, as_instances, set_fields
 from switchfit.runtime.presentation import format_line, join_first
+
+A = TypeVar("A")
+B = TypeVar("B")
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,18 +130,18 @@ class Experiment:
     (array([1.5]), '2020-03-21T00:00:00')
     """
 
-    data: Any
+    data: Converted  # a tuple of `Data`
     mode_sequence: Sequence[str]
-    transition_times: Any = None  # a tuple of Parameter after __post_init__
+    transition_times: Converted = None  # a tuple of `Parameter`
     t0: float = None  # type: ignore[assignment]  # a number after __post_init__, as is tf
     tf: float | Parameter = None  # type: ignore[assignment]
     inputs: Input | None = None
-    initial_state: Any = None
+    initial_state: Converted = None  # an `InitialState`, or None
     name: str | None = None
-    parameter_map: Any = None
+    parameter_map: Converted = None  # a dict of str to str
     time_unit: str = "s"
     jumps: Jump | Sequence[Jump] = ()
-    origin: Any = None
+    origin: Converted = None  # an `Origin`, or None where times are no dates
     time_zone: str | None = None
     is_guess_proposed: bool = field(init=False, default=False)
     taken_from_data: tuple[str, ...] = field(init=False, default=())  # which of "t0" and "tf" were left out
@@ -201,7 +203,7 @@ class Experiment:
         if times is not None:
             times = as_sequence(times, "transition_times", "a sequence of numbers or sf.Parameter")
             times = tuple(read_date(time, "a transition time") for time in times)
-        parts: dict[str, Any] = {"data": data, "jumps": jumps, "inputs": self.inputs, "transition_times": times}
+        parts: dict[str, Converted] = {"data": data, "jumps": jumps, "inputs": self.inputs, "transition_times": times}
         parts |= {name: read_date(getattr(self, name), name) for name in ("t0", "tf")}
         names = {"transition_times": "a transition time", "t0": "t0", "tf": "tf"}
         given = [dates for name, part in parts.items() for dates in list_dates(part, names.get(name, ""))]
@@ -261,7 +263,7 @@ class Experiment:
         return tuple(bounded)
 
     @cached_property
-    def acts(self) -> list[tuple[float, Callable[..., Any]]]:
+    def acts(self) -> list[tuple[float, ResetMap]]:
         """Time and map of each jump, in the order in which they act."""
         acts = [(time, jump.map) for jump in self.jumps for time in np.atleast_1d(jump.time).tolist()]  # type: ignore[union-attr]
         return sorted(acts, key=lambda act: act[0])
@@ -272,12 +274,12 @@ class Experiment:
         return np.array([time for time, _ in self.acts], dtype=np.float64)
 
     @cached_property
-    def passed_by_jumps(self) -> NDArray[np.intp]:
+    def passed_by_jumps(self) -> IntArray:
         """How many of `times` each jump comes after: (K,). One at the time of a fixed transition comes before it."""
         return np.searchsorted(self.initial_times, self.jump_times, "left")
 
     @cached_property
-    def is_jump(self) -> NDArray[np.bool_]:
+    def is_jump(self) -> BoolArray:
         """Which of the N transitions that programs take, `times` and the jumps in between, are jumps: (N,)."""
         both = np.append(self.jump_times, self.initial_times)
         return np.argsort(both, kind="stable") < len(self.jump_times)  # at one time, a jump comes first
@@ -360,9 +362,7 @@ class Experiment:
                         f"{show_time(self, last)}. Give t0 and tf inside that, or a longer signal."
                     )
 
-    def _require_inside(
-        self, what: str, times: FloatArray, outside: NDArray[np.bool_], last: float, bound: str
-    ) -> None:
+    def _require_inside(self, what: str, times: FloatArray, outside: BoolArray, last: float, bound: str) -> None:
         if outside.any():
             raise ValueError(
                 f"{what} must lie inside [t0, tf] = [{show_time(self, self.t0)}, {show_time(self, last)}{bound}]; "
@@ -381,7 +381,7 @@ def _propose_times(t0: float, tf: float, count: int, jumps: Sequence[float]) -> 
     return [time + aside if time in jumps else time for time in np.linspace(t0, tf, count + 2)[1:-1].tolist()]
 
 
-def insert_jumps(experiment: Experiment, of_times: Iterable[Any], of_jumps: Iterable[Any]) -> list[Any]:
+def insert_jumps(experiment: Experiment, of_times: Iterable[A], of_jumps: Iterable[B]) -> list[A | B]:
     """Return an entry for each of an experiment's `times`, with those of the jumps in between.
 
     Parameters
@@ -390,10 +390,10 @@ def insert_jumps(experiment: Experiment, of_times: Iterable[Any], of_jumps: Iter
     of_times, of_jumps : iterable
     """
     times, jumps = iter(of_times), iter(of_jumps)
-    return [next(jumps if is_jump else times) for is_jump in experiment.is_jump.tolist()]
+    return [next(jumps) if is_jump else next(times) for is_jump in experiment.is_jump.tolist()]
 
 
-def drop_jumps(experiment: Experiment, of_all: Iterable[Any]) -> list[Any]:
+def drop_jumps(experiment: Experiment, of_all: Iterable[A]) -> list[A]:
     """Return the entries of the transitions, of those of all transitions and jumps.
 
     Parameters
@@ -411,7 +411,7 @@ def show_time(experiment: Experiment, time: float) -> str:
     return str(time if date is None else date)
 
 
-def count_times(experiment: Experiment, times: Any) -> Any:
+def count_times(experiment: Experiment, times: object) -> object:
     """Return dates as numbers of an experiment's unit since its origin; anything else as it is.
 
     Raises
@@ -427,7 +427,7 @@ def count_times(experiment: Experiment, times: Any) -> Any:
     return experiment.origin.to_numbers(dates, experiment.time_unit)
 
 
-def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
+def initial_state_of(system: HybridSystem, experiment: Experiment) -> InitialState:
     """Return the experiment's initial state, or the system's where it has none of its own."""
     return system.initial_state if experiment.initial_state is None else experiment.initial_state
 
@@ -442,7 +442,7 @@ def prefix_runs(experiments: Sequence[Experiment]) -> list[str]:
     return [""] if len(experiments) == 1 else [f"{name}." for name in name_runs(experiments)]
 
 
-def _check_map(given: Any) -> Mapping[str, str]:
+def _check_map(given: object) -> Mapping[str, str]:
     """Return a map of the model's names to the problem's; empty for None."""
     names = {} if given is None else given
     form = "a dict of the model's name -> the problem's name, such as {'beta': 'beta_run3'}"
@@ -458,7 +458,7 @@ def _require_single(time: Parameter, what: str) -> None:
         raise ValueError(f"{what} must be a single number or a Parameter of one; got the shape {time.shape}.")
 
 
-def _check_final_time(given: Any) -> float | Parameter:
+def _check_final_time(given: object) -> float | Parameter:
     """Return tf as a number, or as a `Parameter` where it is free."""
     if not isinstance(given, Parameter):
         return as_number(given, "tf")

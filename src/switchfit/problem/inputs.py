@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import Converted, FloatArray
 from switchfit.problem.samples import check_samples
 from switchfit.problem.signals import PiecewisePolynomial, fit_spline
 from switchfit.problem.validation.messages import shorten
@@ -62,8 +62,8 @@ class Input:
     ...     return p["r"] * np.array([0.5, 0.5]) @ [u["left"], u["right"]]
     """
 
-    times: Any
-    values: Any
+    times: Converted  # (K,), or `Dates` until an experiment has counted them from its origin
+    values: Converted  # (K,) or (K, q), or a dict of (K,) by name
     kind: Literal["hold", "linear", "cubic"] = "hold"
     units: Sequence[str] | None = None
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from switchfit.arrays import Converted, Traced
 from switchfit.problem.dates import read_dates
 from switchfit.problem.validation.arrays import as_array
 from switchfit.problem.validation.messages import shorten
@@ -60,8 +60,8 @@ class Jump:
     {'k': 0.1, 'V': 9.92}
     """
 
-    time: Any
-    map: Callable[..., object]
+    time: Converted  # a float or a tuple of them, or `Dates` until an experiment has counted them
+    map: Callable[..., Traced]
 
     def __post_init__(self) -> None:
         as_callable(self.map, "Jump map", "a function map(t, x, p)", arguments=3)

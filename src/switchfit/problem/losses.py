@@ -13,14 +13,16 @@ Every function takes arrays of NumPy or JAX; `xp` is their module.
 
 from __future__ import annotations
 
-from typing import Any
+from types import ModuleType
 
 import numpy as np
+
+from switchfit.arrays import Traced
 
 LOSSES = ("linear", "soft_l1", "huber", "cauchy")
 
 
-def robust(loss: str, scale: float, u: Any, xp: Any = np) -> Any:
+def robust(loss: str, scale: float, u: Traced, xp: ModuleType = np) -> Traced:
     """Return ``C**2 rho(u / C**2)``, which replaces u in the cost; the same shape.
 
     Parameters
@@ -42,7 +44,7 @@ def robust(loss: str, scale: float, u: Any, xp: Any = np) -> Any:
     return scale**2 * xp.where(z > 1.0, 2.0 * xp.sqrt(beyond) - 1.0, z)
 
 
-def influence(loss: str, scale: float, u: Any, xp: Any = np) -> Any:
+def influence(loss: str, scale: float, u: Traced, xp: ModuleType = np) -> Traced:
     """Return ``rho'(u / C**2)``, between 0 and 1: the weight of a residual in the Gauss-Newton matrix;
     the same shape.
     """

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import Converted, FloatArray
 from switchfit.problem.losses import LOSSES
 from switchfit.problem.samples import Observe, check_channels, check_samples
 from switchfit.problem.validation.arrays import as_array, as_finite, as_positive, require_deviation
@@ -84,10 +84,10 @@ class Measurements:
     5
     """
 
-    times: Any
-    values: Any
+    times: Converted  # (K,), or `Dates` until an experiment has counted them from its origin
+    values: Converted  # (K, q), NaN where a sample is missing
     observe: Observe | None = None
-    sigma: Any = None
+    sigma: Converted = None  # an array, or a tuple of q numbers and names of parameters, or None
     names: Sequence[str] | None = None
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
     loss_scale: float = 1.0
@@ -136,7 +136,7 @@ class Measurements:
             return ()
         return tuple(entry if isinstance(entry, str) else None for entry in self.sigma)
 
-    def noise(self, parameters: Mapping[str, Any]) -> FloatArray | None:
+    def noise(self, parameters: Mapping[str, float | FloatArray]) -> FloatArray | None:
         """Return the standard deviation of each sample, a (K, q) array, given the model's parameters; None if it is
         unknown.
 
@@ -171,14 +171,14 @@ class Measurements:
         return int(np.count_nonzero(~np.isnan(self.values)))
 
 
-def _read_number_or_name(value: Any, what: str) -> float | str:
+def _read_number_or_name(value: object, what: str) -> float | str:
     """Return a finite number, or the name of the parameter that it is."""
     if isinstance(value, str):
         return as_name(value, what)
     return as_finite(value, f"{what} (a number, or the name of a parameter)")
 
 
-def _check_sigma(sigma: Any, values: FloatArray) -> FloatArray | tuple[str | float, ...] | None:
+def _check_sigma(sigma: object, values: FloatArray) -> FloatArray | tuple[str | float, ...] | None:
     """Return sigma of values (K, q), checked; that of a missing value may be missing too, and becomes 1."""
     shape = values.shape
     if sigma is None:

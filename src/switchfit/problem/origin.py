@@ -10,7 +10,6 @@ import datetime
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,7 +38,7 @@ class Origin:
     time_zone: str
 
     @cached_property
-    def instant(self) -> Any:
+    def instant(self) -> np.datetime64:
         """The date in microseconds: in UTC, or on the wall clock if it has no zone."""
         return read_instant(self.date, "origin")[0]
 
@@ -95,13 +94,16 @@ class Origin:
         """Return a time as a date in the experiment's zone; None if it is not finite or beyond the years 1 to 9999."""
         length = 1e6 * SECONDS_OF_UNIT[normalize_time_unit(time_unit)]
         try:
-            moment: datetime.datetime = self.instant.item() + datetime.timedelta(microseconds=round(time * length))
+            start: datetime.datetime = self.instant.item()  # type: ignore[assignment]  # of microseconds
+            moment = start + datetime.timedelta(microseconds=round(time * length))
             return moment if self.zone is None else moment.replace(tzinfo=datetime.UTC).astimezone(self.zone)
         except (OverflowError, ValueError):
             return None
 
 
-def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, time_zone: Any, t0: Any) -> Origin:
+def choose_origin(
+    given: Sequence[Given], data: Sequence[Given], origin: object, time_zone: object, t0: object
+) -> Origin:
     """Return the origin of an experiment: as given, else t0 if that is a date, else the earliest date of the data.
 
     Parameters
@@ -150,6 +152,6 @@ def choose_origin(given: Sequence[Given], data: Sequence[Given], origin: Any, ti
     return make_origin(min(each.instants.min() for each in located), zone)
 
 
-def make_origin(instant: Any, zone: str) -> Origin:
+def make_origin(instant: np.datetime64, zone: str) -> Origin:
     """Return the origin at a date of `Dates.instants`."""
     return Origin(format_instant(instant, zone), zone)

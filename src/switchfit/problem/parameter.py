@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import Converted, FloatArray
 from switchfit.problem.dates import Dates, list_dates, read_date
 from switchfit.problem.priors import LogNormal, Normal, Prior, PriorTerms
 from switchfit.problem.validation.arrays import as_array
@@ -63,9 +63,9 @@ class Parameter:
     ((), (2,))
     """
 
-    value: Any
-    lower: Any = -np.inf
-    upper: Any = np.inf
+    value: Converted  # an array of any shape, or `Dates` until an experiment has counted it; the bounds likewise
+    lower: Converted = -np.inf
+    upper: Converted = np.inf
     unit: str = ""
     fixed: bool = False
     prior: Prior | None = None
@@ -147,7 +147,7 @@ def require_time_unit(parameter: Parameter, what: str, time_unit: str) -> None:
 
 
 def as_parameter(
-    value: Any, what: str, form: str = "a number, an array or an sf.Parameter", *, fixed: bool = False
+    value: object, what: str, form: str = "a number, an array or an sf.Parameter", *, fixed: bool = False
 ) -> Parameter:
     """Return `value` itself if it is a `Parameter`, otherwise a free or fixed one without bounds.
 

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import Converted, Traced
 from switchfit.problem.dates import Dates, read_date
 from switchfit.problem.validation.arrays import as_array, require_deviation
 from switchfit.problem.validation.messages import shorten
@@ -47,8 +49,8 @@ class Normal:
     array(0.1)
     """
 
-    mean: Any
-    sd: Any
+    mean: Converted  # an array, or `Dates` until an experiment has counted it
+    sd: Converted
 
     def __post_init__(self) -> None:
         set_fields(self, mean=read_date(self.mean, "Normal mean"))
@@ -88,8 +90,8 @@ class LogNormal:
     array(0.1)
     """
 
-    median: Any
-    log_sd: Any
+    median: Converted
+    log_sd: Converted
 
     def __post_init__(self) -> None:
         _check(self, "median", "log_sd")
@@ -100,7 +102,7 @@ class LogNormal:
 Prior = Normal | LogNormal
 
 
-def _check(prior: Any, center: str, spread: str) -> None:
+def _check(prior: Normal | LogNormal, center: str, spread: str) -> None:
     kind = type(prior).__name__
     for name in (center, spread):
         set_fields(prior, **{name: as_array(getattr(prior, name), f"{kind} {name}", finite=name == center)})
@@ -117,9 +119,9 @@ class PriorTerms(NamedTuple):
     log : bool, whether the prior is one of log p
     """
 
-    center: Any
-    precision: Any
-    log: Any
+    center: Traced  # NumPy; of JAX where many problems are evaluated as one batch
+    precision: Traced
+    log: Traced
 
     @classmethod
     def of(cls, prior: Prior | None, shape: tuple[int, ...]) -> PriorTerms:
@@ -145,7 +147,9 @@ class PriorTerms(NamedTuple):
         """Whether any unknown has a prior."""
         return bool(np.any(self.precision > 0))
 
-    def evaluate(self, theta: Any, xp: Any = np, *, gauss_newton: bool = False) -> tuple[Any, Any, Any]:
+    def evaluate(
+        self, theta: Traced, xp: ModuleType = np, *, gauss_newton: bool = False
+    ) -> tuple[Traced, Traced, Traced]:
         """Return the cost (), gradient (d,) and diagonal of the Hessian (d,), or of the Gauss-Newton matrix, at theta
         (d,); for several thetas (B, d), of each.
 

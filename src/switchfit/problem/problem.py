@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
 from itertools import pairwise, repeat
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import BoolArray, Converted, FloatArray, IntArray
 from switchfit.optimize import LinearConstraints
 from switchfit.problem.consistency import check_durations, check_names, check_parameters
 from switchfit.problem.constraints import Constraint, ConstraintKind
@@ -120,8 +120,8 @@ class Problem:
     """
 
     system: HybridSystem
-    experiments: Any
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+    experiments: Converted  # a tuple of `Experiment`
+    parameters: Mapping[str, Converted] = field(default_factory=dict)
     min_duration: float | Mapping[str, float] = 0.0
     solver: Literal["auto", "explicit", "stiff"] = "auto"
     rtol: float = 1e-8
@@ -233,7 +233,7 @@ class Problem:
         changed._set_experiments(experiments)
         return changed
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """What is pickled: the user's functions, and of their traces what identifies them."""
         return {name: getattr(self, name) for name in PROBLEM_ARGUMENTS} | {"digests": self.digests}
 
@@ -242,7 +242,7 @@ class Problem:
         """What identifies the functions of each experiment in every process."""
         return [structure.digests for structure in self.structures]
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, Converted]) -> None:
         """Build the problem again; ValueError if a function does something else than when the problem was built."""
         set_fields(self, **{name: state[name] for name in PROBLEM_ARGUMENTS})
         self.__post_init__()
@@ -319,7 +319,7 @@ class Problem:
         return not any(item.sigma_names or item.loss != "linear" for item in self.measurements)
 
     @cached_property
-    def is_sigma(self) -> NDArray[np.bool_]:
+    def is_sigma(self) -> BoolArray:
         """Which unknowns are the sigma of Measurements: (d,)."""
         given = [(run, name) for run in self.experiments for item in run.measurements for name in item.sigma_names]
         return np.isin(self.theta_names, [run.parameter_map.get(name, name) for run, name in given if name])
@@ -359,7 +359,7 @@ class Problem:
         return max(0.5 * PERFECT_RESIDUAL**2 * squares, 1e-300)
 
     @cached_property
-    def places(self) -> tuple[NDArray[np.intp], ...]:
+    def places(self) -> tuple[IntArray, ...]:
         """For each experiment the positions in theta of its N transition times and of its p (M,), -1 where fixed.
 
         Jumps are among the N, as transitions at fixed times.
@@ -371,7 +371,7 @@ class Problem:
         )
 
     @cached_property
-    def own_places(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    def own_places(self) -> list[tuple[IntArray, IntArray]]:
         """For each experiment which entries of what its programs take are unknowns, and their positions in theta."""
         return [(own, places[own]) for places in self.places for own in [np.flatnonzero(places >= 0)]]
 
@@ -579,7 +579,7 @@ class Problem:
         }
 
 
-def place_parameters(problem: Problem, e: int, structure: Structure) -> NDArray[np.intp]:
+def place_parameters(problem: Problem, e: int, structure: Structure) -> IntArray:
     """Return the positions in theta of the p (M,) of a structure of experiment e."""
     mapped, states = problem.experiments[e].parameter_map, problem.unknowns.initial_states[e]
     parts = [states[:0]]

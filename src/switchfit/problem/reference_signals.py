@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import Converted, FloatArray
 from switchfit.problem.dates import Dates
 from switchfit.problem.samples import Observe, check_channels, check_samples, count_seconds
 from switchfit.problem.signals import PiecewisePolynomial, filter_lowpass, fit_spline
@@ -20,7 +19,7 @@ from switchfit.problem.validation.tables import find_labels
 from switchfit.runtime.presentation import format_count, format_line, join_first
 
 
-def _interpolate(given: Any, values: FloatArray, lowpass_hz: float | None) -> PiecewisePolynomial:
+def _interpolate(given: FloatArray | Dates, values: FloatArray, lowpass_hz: float | None) -> PiecewisePolynomial:
     """Return the signal of samples (K,) and (K, q), broken at times that are given twice, and filtered if asked for."""
     # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
     times = count_seconds(given) if isinstance(given, Dates) else given
@@ -70,11 +69,11 @@ class ReferenceSignal:
     1
     """
 
-    signal: Any
+    signal: Converted  # a PiecewisePolynomial
     observe: Observe | None = None
-    weights: Any = None
+    weights: Converted = None  # W, (q, q)
     names: Sequence[str] | None = None
-    samples: tuple[Any, FloatArray] | None = None
+    samples: tuple[FloatArray | Dates, FloatArray] | None = None
     lowpass_hz: float | None = None
     units: Sequence[str] | None = None
 

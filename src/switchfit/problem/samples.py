@@ -3,31 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, Traced
 from switchfit.problem.dates import FIRST_DAY, Dates, read_dates
 from switchfit.problem.time_units import TIMEDELTA_OF_UNIT
 from switchfit.problem.validation.arrays import as_array
 from switchfit.problem.validation.names import as_labels
 from switchfit.problem.validation.objects import as_callable, set_fields
 
-Observe = Callable[..., Any]
+Observe = Callable[..., Traced]
 """``h(t, x, p) -> (q,)``: the output of a sensor."""
 
 
+class Observed(Protocol):
+    """`Measurements` or a `ReferenceSignal`: data that compare an output of the state."""
+
+    @property
+    def observe(self) -> Observe | None:
+        """The output; None for the whole state."""
+
+
 def check_samples(
-    times: Any,
-    values: Any,
+    times: object,
+    values: object,
     what: str,
     *,
     at_least: int,
     breaks: bool = False,
     missing: bool = False,
     columns: bool = True,
-) -> tuple[Any, FloatArray]:
+) -> tuple[FloatArray | Dates, FloatArray]:
     """Return times (K,) and values (K,) or (K, q) as float64, checked against each other; dates remain dates.
 
     With `breaks`, a time may occur twice; with `missing`, values may be NaN; without
@@ -68,7 +76,7 @@ def count_seconds(dates: Dates) -> FloatArray:
     return np.asarray((dates.instants - first) / TIMEDELTA_OF_UNIT["s"])
 
 
-def check_channels(item: Any, q: int, names: Any, units: Any) -> None:
+def check_channels(item: Observed, q: int, names: object, units: object) -> None:
     """Check the function of a data item that makes q channels; set their names and units.
 
     They are those of a table where they are left out.

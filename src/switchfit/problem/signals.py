@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, IntArray
 
 MOST_FILTERED = 10**7
 """Largest number of points at which a signal is filtered."""
@@ -48,7 +48,7 @@ class PiecewisePolynomial:
         """Number of channels, q."""
         return int(self.coefficients.shape[2])
 
-    def interval(self, times: FloatArray) -> NDArray[np.intp]:
+    def interval(self, times: FloatArray) -> IntArray:
         """Return the index of the knot interval that holds each of `times`; beyond the ends, the first or the last."""
         return self.knots[1:-1].searchsorted(times, side="right")
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import Traced
 from switchfit.problem.functions import Function
 
 REST = ""
@@ -130,7 +132,7 @@ class Structure:
         """Whether a reset map acts at a transition that is no jump: what is measured jumps as it passes a sample."""
         return not set(self.resets) <= set(self.jumps)
 
-    def fix_sides(self, side: Any, xp: Any) -> Any:
+    def fix_sides(self, side: Traced, xp: ModuleType) -> Traced:
         """Return the side of each transition time at a node: `side` (), or an array (N,) with +1 for the jumps."""
         if not self.jumps:
             return side

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from switchfit.arrays import Converted, FloatArray, Traced
 from switchfit.problem.parameter import Parameter, as_parameter
 from switchfit.problem.validation.arrays import as_array
 from switchfit.problem.validation.messages import shorten
@@ -17,17 +14,20 @@ from switchfit.problem.validation.names import as_labels, as_name, require_known
 from switchfit.problem.validation.objects import as_callable, set_fields
 from switchfit.runtime.presentation import format_line, join_first
 
-VectorField = Callable[..., Any]
+VectorField = Callable[..., Traced]
 """``f(t, x, p) -> (n,)``, or ``f(t, x, p, u) -> (n,)`` in an experiment with inputs."""
 
-ResetMap = Callable[..., Any]
+ResetMap = Callable[..., Traced]
 """``R(t, x, p) -> (n,)``: the state just after a transition from the state just before it."""
 
-Guard = Callable[..., Any]
+Guard = Callable[..., Traced]
 """``g(t, x, p) -> ()``: zero where a transition happens, of the state just before it."""
 
-AtTransitions = Mapping[tuple[str, str], Callable[..., Any]]
+AtTransitions = Mapping[tuple[str, str], Callable[..., Traced]]
 """Functions by the modes before and after a transition."""
+
+InitialState = Callable[..., Traced] | FloatArray | tuple[Parameter, ...]
+"""``x0(p) -> (n,)``, the state itself (n,), or n `Parameter` of which some are estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class HybridSystem:
     """
 
     modes: Mapping[str, VectorField]
-    initial_state: Any
+    initial_state: Converted  # an `InitialState`
     reset_maps: Mapping[tuple[str, str], ResetMap] = field(default_factory=dict)
     state_names: Sequence[str] | None = None
     state_units: Sequence[str] | None = None
@@ -109,7 +109,7 @@ class HybridSystem:
         if not callable(self.initial_state):
             self.check_labels_of(len(self.initial_state))
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[type, tuple[object, ...]]:
         """How it is copied and pickled: built again, from dicts, since a mappingproxy cannot be pickled."""
         return type(self), tuple(dict(v) if isinstance(v, Mapping) else v for v in vars(self).values())
 
@@ -129,7 +129,7 @@ class HybridSystem:
             as_labels(getattr(self, label), label, "state", n)
 
 
-def as_state(value: Any) -> Callable[..., Any] | NDArray[np.float64] | tuple[Parameter, ...]:
+def as_state(value: object) -> InitialState:
     """Return `value` as a finite, read-only ``(n,)`` float64 array, or as n `Parameter` if it contains any.
 
     A function is returned as it is.

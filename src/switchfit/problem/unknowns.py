@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.problem.constraints import Constraint, ConstraintKind
 from switchfit.problem.experiment import Experiment, initial_state_of, name_runs, prefix_runs
 from switchfit.problem.parameter import Parameter
@@ -23,6 +23,8 @@ from switchfit.problem.priors import PriorTerms
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation.messages import join_names, unit_suffix
 from switchfit.problem.variables import LEAST_PART_OF_GUESS, Variables
+
+N = TypeVar("N", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -51,22 +53,22 @@ class Unknowns:
     initial: FloatArray
     lower: FloatArray
     upper: FloatArray
-    times: tuple[NDArray[np.intp], ...]
+    times: tuple[IntArray, ...]
     parameters: Mapping[str, slice]
-    initial_states: tuple[NDArray[np.intp], ...]
+    initial_states: tuple[IntArray, ...]
     A: FloatArray
     b: FloatArray
     rows: tuple[Constraint, ...]
     priors: PriorTerms
-    log: NDArray[np.bool_]
+    log: BoolArray
     starts: tuple[float, ...]
 
     @cached_property
-    def is_time(self) -> NDArray[np.bool_]:
+    def is_time(self) -> BoolArray:
         """Which of the unknowns are transition times or a free tf: (d,)."""
         return self.put_at_times(np.zeros(len(self.names), dtype=bool), [True] * len(self.times))
 
-    def put_at_times(self, array: NDArray[Any], values: Sequence[Any]) -> NDArray[Any]:
+    def put_at_times(self, array: NDArray[N], values: Sequence[float]) -> NDArray[N]:
         """Return an array (d,) with the value of each experiment in place of the entries of its free times."""
         changed = array.copy()
         for value, where in zip(values, self.times, strict=True):
@@ -92,7 +94,7 @@ class Unknowns:
         )
 
     @cached_property
-    def log_times(self) -> NDArray[np.bool_]:
+    def log_times(self) -> BoolArray:
         """Which of the unknowns are transition times, or a free tf, on a logarithmic scale: (d,)."""
         return self.log & self.is_time
 
@@ -130,7 +132,7 @@ def list_unknowns(
         pieces.append(parameter)
         return slice(first, len(names))
 
-    where: list[NDArray[np.intp]] = []
+    where: list[IntArray] = []
     prefixes = prefix_runs(experiments)
     for prefix, experiment in zip(prefixes, experiments, strict=True):
         positions = np.full(len(experiment.times), -1, dtype=np.intp)
@@ -140,15 +142,16 @@ def list_unknowns(
                 positions[i] = add(f"{prefix}{name}", experiment.time_unit, tau).start
         where.append(positions)
     spans = {name: add(name, q.unit, q) for name, q in parameters.items() if not q.fixed}
-    states: list[NDArray[np.intp]] = []
+    states: list[IntArray] = []
     for prefix, experiment in zip(prefixes, experiments, strict=True):
         initial = initial_state_of(system, experiment)
-        positions = np.full(0 if callable(initial) else len(initial), -1, dtype=np.intp)
-        for k in range(len(positions)):
-            if isinstance(initial[k], Parameter) and not initial[k].fixed:
+        entries = () if callable(initial) else tuple(initial)
+        positions = np.full(len(entries), -1, dtype=np.intp)
+        for k, entry in enumerate(entries):
+            if isinstance(entry, Parameter) and not entry.fixed:
                 name = system.state_names[k] if system.state_names else f"x{k + 1}"
-                unit = initial[k].unit or (system.state_units[k] if system.state_units else "")
-                positions[k] = add(f"{prefix}{name}(t0)", unit, initial[k]).start
+                unit = entry.unit or (system.state_units[k] if system.state_units else "")
+                positions[k] = add(f"{prefix}{name}(t0)", unit, entry).start
         states.append(positions)
     if len(set(names)) != len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -164,7 +167,7 @@ def list_unknowns(
 
 
 def _build_ordering(
-    experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, durations: Mapping[str, float]
+    experiments: tuple[Experiment, ...], where: list[IntArray], d: int, durations: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, tuple[Constraint, ...]]:
     """Return rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
     rows, bounds, constraints = [], [], []

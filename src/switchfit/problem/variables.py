@@ -8,12 +8,12 @@ logarithm is 0; for a transition time it is the t0 of its experiment.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import BoolArray, FloatArray, Traced
 
 ORDINARY = (1e-3, 1e3)
 """Range of sizes in which an unknown is not scaled; the tolerance on the gradient is then that of theta itself."""
@@ -28,13 +28,13 @@ class Variables(NamedTuple):
     ``origin`` (d,) of logarithms.
     """
 
-    size: Any
-    log: Any
-    origin: Any = 0.0
+    size: Traced  # NumPy; of JAX where many problems are evaluated as one batch
+    log: Traced
+    origin: Traced = 0.0
 
     @classmethod
     def of(
-        cls, theta: FloatArray, bounds: FloatArray, log: NDArray[np.bool_], keep: NDArray[np.bool_], origin: FloatArray
+        cls, theta: FloatArray, bounds: FloatArray, log: BoolArray, keep: BoolArray, origin: FloatArray
     ) -> Variables:
         """Return variables scaled by the first guess, or by the bounds if it is 0.
 
@@ -59,11 +59,11 @@ class Variables(NamedTuple):
         return not self.log.any() and bool(np.all(self.size == 1.0))
 
     @np.errstate(over="ignore")  # a step too far on a logarithmic scale is refused, as J is not finite there
-    def outward(self, z: Any, xp: Any = np) -> Any:
+    def outward(self, z: Traced, xp: ModuleType = np) -> Traced:
         """Return theta at z: (d,)."""
         return xp.where(self.log, self.origin + xp.exp(xp.where(self.log, z, 0.0)), self.size * z)
 
-    def inward(self, theta: Any, xp: Any = np) -> Any:
+    def inward(self, theta: Traced, xp: ModuleType = np) -> Traced:
         """Return z at theta (d,): of a logarithm, a bound at the origin is `LEAST_PART_OF_GUESS` first guesses away."""
         away = theta - self.origin
         positive = xp.where(self.log, xp.where(away > 0, away, LEAST_PART_OF_GUESS * self.size), 1.0)
@@ -73,18 +73,22 @@ class Variables(NamedTuple):
         """Return sizes of z for sizes of theta (d,); the size of a logarithm is 1."""
         return np.where(self.log, 1.0, sizes / self.size)
 
-    def slopes(self, theta: Any, xp: Any = np) -> tuple[Any, Any]:
+    def slopes(self, theta: Traced, xp: ModuleType = np) -> tuple[Traced, Traced]:
         """Return D and E at theta: (d,) each."""
         away = theta - self.origin
         return xp.where(self.log, away, self.size), xp.where(self.log, away, 0.0)
 
-    def derivatives_outward(self, theta: Any, gradient: Any, hessian: Any, xp: Any = np) -> tuple[Any, Any]:
+    def derivatives_outward(
+        self, theta: Traced, gradient: Traced, hessian: Traced, xp: ModuleType = np
+    ) -> tuple[Traced, Traced]:
         """Return the gradient and Hessian in theta from those in z."""
         D, E = self.slopes(theta, xp)
         gradient = gradient / D
         return gradient, (hessian - xp.diag(E * gradient)) / xp.outer(D, D)
 
-    def derivatives_inward(self, theta: Any, gradient: Any, hessian: Any, xp: Any = np) -> tuple[Any, Any]:
+    def derivatives_inward(
+        self, theta: Traced, gradient: Traced, hessian: Traced, xp: ModuleType = np
+    ) -> tuple[Traced, Traced]:
         """Return the gradient and Hessian in z from those in theta."""
         D, E = self.slopes(theta, xp)
         return D * gradient, hessian * xp.outer(D, D) + xp.diag(E * gradient)
