@@ -38,7 +38,7 @@ fuzz: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) -m fuzz
 
 coverage: $(VENV)/.installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_uncertainty.py tests/test_online_statistics.py -m slow -k "not unstable" -v -s
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/uncertainty/test_uncertainty.py tests/online/test_online_statistics.py -m slow -k "not unstable" -v -s
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
@@ -82,7 +82,7 @@ paper: $(VENV)/.installed
 	cp out/paper/results.json docs/paper-results.json
 
 release-check: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest tests/test_release.py -m "slow or not slow" -s
+	$(BIN)/python -m pytest tests/house/test_release.py -m "slow or not slow" -s
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -W --keep-going -q docs out/docs

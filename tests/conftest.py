@@ -74,13 +74,14 @@ def pytest_configure(config):
     compilation.compile_modules = program_cache.compile_modules = compile_quickly
 
 
-TOGETHER = ("test_adjoint", "test_native", "test_prediction")
+TOGETHER = ("test_adjoint", "test_machine_code", "test_prediction")
 """Files that share the programs of `systems.case`, which are most of what they take: one process runs them all."""
 
 BEGIN_FIRST = (
-    "batch docs real_logs protocol runs final_time paper html zero_times_nan beam insertion modes inputs "
-    "stiffness first_ten_minutes jumps cli strategy files docstrings starts closed_form random_systems batch_intervals "
-    "guards known_answers units bootstrap examples estimate vehicles plots verdict dates cli_modes"
+    "batch docs losses_priors_delays both_engines several_runs free_final_time claims html_page zero_times_nan beam "
+    "insertion_rates modes named_inputs stiffness tutorial jumps commands strategy files docstrings "
+    "starts_benchmark matrix_exponentials random_systems intervals_of_many guards known_answers time_units "
+    "bootstrap examples estimate vehicles figures verdict dates modes_command"
 )
 LONGEST = [*TOGETHER, *(f"test_{name}" for name in BEGIN_FIRST.split())]
 """Files that begin first, so that no process works alone for long at the end."""
@@ -154,7 +155,7 @@ def quick_processes(monkeypatch):
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
     """A headless Chromium."""
-    from browser import Browser, find_browser
+    from support.browser import Browser, find_browser
 
     if find_browser() is None:
         pytest.skip("no Chromium on this machine")

@@ -14,9 +14,9 @@ along the time of a birth is the jump of the vector field, ``f_before - f_after`
 After each grid interval the point of linearisation moves to the minimum, ``x += Z d`` with ``d = -H^-1 g``, as in an
 extended Kalman filter; a few times along the log, and at its end, all hypotheses are propagated anew from t0 with the
 times and parameters to which they have moved, since the sum of many steps of a linear model is not where the system is.
-What is left at the end are thus fits of a few Gauss-Newton iterations each. Of 20 random truths of `tests/test_beam.py`
-the true sequence is the best proposal in 20; in 19 if only the end is propagated anew, in 11 without that, and in none
-if the point of linearisation does not move and the parameter is 20 % off.
+What is left at the end are thus fits of a few Gauss-Newton iterations each. Of 20 random truths of
+`tests/strategy/test_beam.py` the true sequence is the best proposal in 20; in 19 if only the end is propagated anew, in
+11 without that, and in none if the point of linearisation does not move and the parameter is 20 % off.
 
 A guard ``c(tau, x(tau-), p) = 0`` counts as a measurement of c at the birth, so precise that it determines tau:
 ``dtau = -(D_x c Z + D_p c) / (D_x c f + D_t c)``. Births that are far from where their guard is met have a high cost.

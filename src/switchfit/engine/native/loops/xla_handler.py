@@ -1,7 +1,8 @@
 """The handler by which XLA calls machine code: it reads the arguments and results from XLA's call frame.
 
 Only a few fields of the frame are read. Their offsets are fixed by XLA's C interface for foreign functions
-(``xla/ffi/api/c_api.h``); `tests/test_native.py` compares them with the header of the JAX that is installed.
+(``xla/ffi/api/c_api.h``); `tests/engine/test_machine_code.py` compares them with the header of the JAX that is
+installed.
 """
 
 from __future__ import annotations

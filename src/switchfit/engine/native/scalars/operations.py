@@ -1,8 +1,8 @@
 """Operations of an expression graph, one row each: types of operands and result, value, LLVM code.
 
 To add a function of the C library that JAX has under the same name, add one line here: `tracing` finds it by its
-primitive, `graph` folds constants by its value, `llvm` writes its code, and `tests/test_operations.py` compares the
-three.
+primitive, `graph` folds constants by its value, `llvm` writes its code, and `tests/engine/test_operations.py` compares
+the three.
 """
 
 from __future__ import annotations

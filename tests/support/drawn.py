@@ -1,0 +1,121 @@
+"""Mistakes drawn over all rooms by a rule, for `mutate.MISTAKES`: not by hand, which would draw where tests look.
+
+The rule: in each room, of all comparisons, sums, products and conjunctions in its functions the `PER_ROOM` whose lines
+have the smallest hashes, each replaced by its opposite. A line stays drawn until it is changed.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+PER_ROOM = 2
+
+OPPOSITES: dict[type[ast.AST], tuple[str, str]] = {
+    ast.Lt: ("<", ">="),
+    ast.LtE: ("<=", ">"),
+    ast.Gt: (">", "<="),
+    ast.GtE: (">=", "<"),
+    ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="),
+    ast.Is: ("is", "is not"),
+    ast.IsNot: ("is not", "is"),
+    ast.In: ("in", "not in"),
+    ast.NotIn: ("not in", "in"),
+    ast.Add: ("+", "-"),
+    ast.Sub: ("-", "+"),
+    ast.Mult: ("*", "/"),
+    ast.Div: ("/", "*"),
+    ast.And: ("and", "or"),
+    ast.Or: ("or", "and"),
+}
+
+NAMES = {
+    "batch": "batch intervals_of_many bootstrap many_logs verdicts_of_many starts_benchmark",
+    "cli": "commands modes_command saved_estimates experiment_design online_command first_problem many_logs",
+    "discretization": "rows_and_nodes hard_moments implicit_rows random_systems stiffness both_engines",
+    "engine": "corners rows_and_nodes stiffness following both_engines machine_code",
+    "engine/native": "machine_code both_engines random_systems beam implicit_rows operations functions_of_jax",
+    "estimation": "saved_estimates estimate saved_fits rows_and_nodes following bad_input hard_moments",
+    "experiment_design": "experiment_design",
+    "fit": "estimate jumps following finiteness starts_benchmark strategy guards verdict logarithmic_times",
+    "io": "problem_files saved_estimates first_problem frames files many_logs",
+    "io/logs": "text_logs log_formats time_units losses_priors_delays gps_drive dates",
+    "io/problem_file": "problem_files first_problem files dates saved_estimates bad_input modes_command jumps",
+    "models": "vehicles vehicle_mechanics",
+    "modes": "modes schedules insertion_rates",
+    "online": "online online_command",
+    "optimize": "sqp qp equalities arrow batch strategy several_runs",
+    "paper": "claims matrix_exponentials",
+    "problem": "bad_input cost_of_data corners dates numbers_given validation functions_of_jax finiteness zero_times_nan",
+    "report": "online_report fit_report figures verdict frames modes validation numbers_given verdicts_of_many",
+    "report/html": "html_page",
+    "runtime": "progress saved_fits files threads bad_input",
+    "strategy": "validation strategy beam numbers_given starts_benchmark free_final_time",
+    "uncertainty": "uncertainty profiles prediction verdict validation",
+}
+TESTS = {room: names.split() for room, names in NAMES.items()}
+"""What must notice the mistakes of each room: files of tests, one after the other until something does."""
+
+
+def draw_mistakes(source: Path) -> Iterator[tuple[str, str, str, str, str]]:
+    """Yield room, name, file, text and text with the mistake of each mistake that the rule draws."""
+    for room in TESTS:
+        paths = sorted([*source.glob(f"{room}.py"), *(source / room).glob("*.py")])  # of a module or a folder
+        found = [each for path in paths for each in _list_mistakes(path)]
+        by_hash = {key: mistake for key, *mistake in found}  # one of those that a line has twice
+        for key in sorted(by_hash)[:PER_ROOM]:
+            name, path, text, mistaken = by_hash[key]
+            yield room, name, str(path.relative_to(source)), text, mistaken
+
+
+def _list_mistakes(path: Path) -> Iterator[tuple[str, str, Path, str, str]]:
+    """Yield hash, name, file, text and mistaken text of each mistake that could be drawn in a file."""
+    text = path.read_text()
+    lines, tree = text.splitlines(keepends=True), ast.parse(text)
+    starts = [0]
+    for line in lines:
+        starts.append(starts[-1] + len(line.encode()))
+    encoded = text.encode()
+    for node in _list_expressions(tree):
+        for kind, left, right in _list_operators(node):
+            old, new = OPPOSITES[kind]
+            begin = starts[left.end_lineno - 1] + left.end_col_offset
+            end = starts[right.lineno - 1] + right.col_offset
+            between = encoded[begin:end].decode()
+            if between.count(old) != 1:
+                continue
+            mistaken = encoded[:begin].decode() + between.replace(old, new) + encoded[end:].decode()
+            line = lines[left.end_lineno - 1].strip()
+            where = f"{path.name}: {old} -> {new} in {line} ({left.end_col_offset - node.col_offset})"
+            yield hashlib.sha256(where.encode()).hexdigest(), where, path, text, mistaken
+
+
+def _list_expressions(tree: ast.AST) -> Iterator[ast.expr]:
+    """Yield all expressions in functions, but for annotations, errors and what is only for type checkers."""
+    stack = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    seen: set[ast.AST] = set()
+    while stack:
+        node = stack.pop()
+        if node in seen or isinstance(node, ast.Raise | ast.arguments):
+            continue
+        seen.add(node)
+        if isinstance(node, ast.BinOp | ast.Compare | ast.BoolOp):
+            yield node
+        children = [node.value] if isinstance(node, ast.AnnAssign) and node.value else list(ast.iter_child_nodes(node))
+        stack += [child for child in children if child is not getattr(node, "returns", None)]
+
+
+def _list_operators(node: ast.expr) -> Iterator[tuple[type[ast.AST], ast.expr, ast.expr]]:
+    """Yield the operators of an expression with what is on their left and right."""
+    if isinstance(node, ast.BinOp):
+        operators, operands = [node.op], [node.left, node.right]
+    elif isinstance(node, ast.Compare):
+        operators, operands = list(node.ops), [node.left, *node.comparators]
+    elif isinstance(node, ast.BoolOp):
+        operators, operands = [node.op] * (len(node.values) - 1), node.values
+    for operator, left, right in zip(operators, operands, operands[1:], strict=False):
+        if type(operator) in OPPOSITES and not any(isinstance(each, ast.JoinedStr) for each in (left, right)):
+            yield type(operator), left, right
