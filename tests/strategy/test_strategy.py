@@ -618,7 +618,8 @@ def test_minima_that_the_data_do_not_tell_apart_are_named():
 
 
 def test_a_minimum_beside_a_fit_with_estimated_sigmas_is_found():
-    """A wheel brakes on a road that becomes wet at 0.9 s; 0.02 s earlier, with more noise, is a minimum, too."""
+    """A wheel brakes on a road that becomes wet at 0.9 s; 0.02 s earlier, with more noise, is a minimum, too: the guess
+    lies beside it."""
 
     def roll(road):
         def wheel(t, x, p):
@@ -630,17 +631,18 @@ def test_a_minimum_beside_a_fit_with_estimated_sigmas_is_found():
 
     wheel = sf.HybridSystem({road: roll(road) for road in ("dry", "wet")}, lambda p: jnp.stack([p["v"], p["v"] / 0.3]))
     log = sf.Measurements(np.arange(0.02, 1.6, 0.02), np.zeros((79, 2)), sigma=[0.1, 0.5])
-    slips = {name: sf.Parameter(value, scale="log") for name, value in {"dry": 0.7, "wet": 0.7, "s": 0.07}.items()}
-    problem = one_run(wheel, log, ("dry", "wet"), (0.6,), 1.58, slips | {"v": 24.0})
+    slips = {name: sf.Parameter(value, scale="log") for name, value in {"dry": 0.88, "wet": 0.51, "s": 0.097}.items()}
+    problem = one_run(wheel, log, ("dry", "wet"), (0.87,), 1.58, slips | {"v": 25.0})
     truth = [0.9, 0.9, 0.5, 0.1, 25.0]
     (run,) = simulate_log(problem, truth, seed=18).experiments
-    sigmas = {name: sf.Parameter(0.3, scale="log") for name in ("sigma_v", "sigma_w")}
+    sigmas = {name: sf.Parameter(value, scale="log") for name, value in {"sigma_v": 0.09, "sigma_w": 0.57}.items()}
     run = replace(run, data=replace(run.data[0], sigma=list(sigmas)))
     problem = replace(problem, experiments=run, parameters=problem.parameters | sigmas)
     near, right = (
-        sf.estimate(problem, start=[*start, 0.3, 0.3], strategy="local")
-        for start in ([0.6, 0.7, 0.7, 0.07, 24.0], truth)
+        sf.estimate(problem, strategy="local"),
+        sf.estimate(problem, start=[*truth, 0.1, 0.5], strategy="local"),
     )
+    assert (near.theta[0], right.theta[0]) == pytest.approx((0.88, 0.9), abs=0.005)
     assert near.cost > right.cost + 5.0
     fit = fit_problem(problem, level="good")
     assert fit.cost < right.cost + 0.01
