@@ -49,7 +49,8 @@ NAMES = {
     "online": "online online_command",
     "optimize": "sqp qp equalities arrow batch strategy several_runs",
     "paper": "claims matrix_exponentials",
-    "problem": "bad_input cost_of_data corners dates numbers_given validation functions_of_jax finiteness zero_times_nan",
+    "problem": "bad_input cost_of_data corners dates numbers_given validation functions_of_jax finiteness "
+    "zero_times_nan",
     "report": "online_report fit_report figures verdict frames modes validation numbers_given verdicts_of_many",
     "report/html": "html_page",
     "runtime": "progress saved_fits files threads bad_input",

@@ -18,7 +18,7 @@ from support.places import ROOT
 
 SOURCE = ROOT / "src" / "switchfit"
 
-PAPER, DESIGN, OPTIMIZE, ROWS = "paper_adjoint.py", "experiment_design", "optimize", "discretization"
+PAPER, DESIGN, OPTIMIZE, ROWS = "paper_adjoint", "experiment_design", "optimize", "discretization"
 JAX, NATIVE, CORNERS, SPLIT = "engine/jax", "engine/native", "problem/corners", "engine/corners"
 
 SYSTEMS = ["tests/engine/test_random_systems.py", "-k", "machine_code or each_engine"]
@@ -389,7 +389,7 @@ MISTAKES = {(part, name): mistake for part, found in BY_HAND.items() for name, m
 def mutate(part: str, name: str) -> dict[str, str]:
     """Return the files of a mistake with the mistake in them; ValueError unless the room has each text exactly once."""
     where, replacements = MISTAKES[part, name]
-    paths = sorted((SOURCE / where).rglob("*.py")) or [SOURCE / where]
+    paths = sorted((SOURCE / where).rglob("*.py")) or [(SOURCE / where).with_suffix(".py")]
     files = {str(path.relative_to(SOURCE)): path.read_text() for path in paths}
     changed = {}
     for old, new in replacements:
