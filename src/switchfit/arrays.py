@@ -25,6 +25,9 @@ Traced: TypeAlias = Any
 """What generic code computes with: an array of NumPy or JAX, a tracer, or an object array of nodes of a graph. These
 have no common type; they have the operators of arrays."""
 
+ArrayModule: TypeAlias = Any
+"""The module that computes with them, `xp`: `numpy`, `jax.numpy`, or the namespace of a graph of scalars."""
+
 Converted: TypeAlias = Any
 """A field of a dataclass that takes what users give, in every form that its docstring lists, and holds one checked form
 once the object is built: the comment beside the field says which."""

@@ -65,9 +65,9 @@ from switchfit.discretization.model import Field, Model
 from switchfit.discretization.path_costs import compute_path_cost
 from switchfit.discretization.propagation import Path, pick_at_cells, propagate, switch_method, switch_mode
 from switchfit.discretization.rows import combine
+from switchfit.discretization.runge_kutta import Tableau
 from switchfit.discretization.sampled_states import find_late_rows, step_to_late_sample
 from switchfit.discretization.signals import Piece
-from switchfit.discretization.tableaus import Tableau
 from switchfit.problem.structure import Structure
 
 Array = jax.Array

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
+from jax import Array
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
@@ -19,8 +19,6 @@ from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
-
-Array = jax.Array
 
 
 class Samples(NamedTuple):

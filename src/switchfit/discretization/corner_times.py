@@ -21,16 +21,16 @@ from switchfit.problem.padding import pad_length
 from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
 
-GRID, HALVINGS = 16, 60
+GRID_PARTS, CROSSING_HALVINGS = 16, 60
 """Parts of a cell at whose ends the sign of g is compared, and halvings of the part in which it changes."""
 
-FEWEST = 1024
+FEWEST_COMPILED_TIMES = 1024
 """Smallest number of times for which a program is compiled."""
 
 APART = 1e-10
 """Part of the horizon between a jump and the nodes beside it. Corners nearer than half of that to a node are on it."""
 
-LEVEL = 1e-13
+ZERO_LEVEL = 1e-13
 """Part of the largest |g| that counts as 0: a signal that stays at its limit does not cross it by rounding."""
 
 
@@ -68,7 +68,7 @@ def _evaluate(
     shape = structure.input_shape
     u = [] if shape is None else [experiment.signals[-1](times).reshape(-1, *shape)]
     # Padded by repeating them, so that the grid and the bisection, and logs of similar length, share a program.
-    size = pad_length(max(len(times), FEWEST))
+    size = pad_length(max(len(times), FEWEST_COMPILED_TIMES))
     t, *u = (np.resize(each, (size, *each.shape[1:])) for each in (times, *u))
     with use_float64(), use_compilation_cache():
         return [np.asarray(g)[: len(times)] for g in corners(t, u, values)]
@@ -76,13 +76,13 @@ def _evaluate(
 
 def _find_crossings(evaluate: Callable[[FloatArray], list[FloatArray]], nodes: FloatArray) -> list[FloatArray]:
     """Return the times at which bends and at which jumps change their signs between nodes."""
-    grid, found = np.linspace(nodes[:-1], np.nextafter(nodes[1:], nodes[:-1]), GRID + 1, axis=1), []
+    grid, found = np.linspace(nodes[:-1], np.nextafter(nodes[1:], nodes[:-1]), GRID_PARTS + 1, axis=1), []
     for kind, g in enumerate(evaluate(grid.ravel())):
-        level = LEVEL * np.fmax.reduce(np.abs(g), axis=0, initial=0.0)
+        level = ZERO_LEVEL * np.fmax.reduce(np.abs(g), axis=0, initial=0.0)
         signs = _find_signs(g, level).reshape(*grid.shape, -1)
         cell, part, which = np.nonzero(signs[:, 1:] != signs[:, :-1])
         low, high, begins = grid[cell, part], grid[cell, part + 1], signs[cell, part, which]
-        for _ in range(HALVINGS if len(cell) else 0):
+        for _ in range(CROSSING_HALVINGS if len(cell) else 0):
             middle = 0.5 * (low + high)
             is_before = _find_signs(evaluate(middle)[kind][range(len(cell)), which], level[which]) == begins
             low, high = np.where(is_before, middle, low), np.where(is_before, high, middle)

@@ -14,13 +14,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import ArrayModule, FloatArray, IntArray, Traced
 from switchfit.discretization.stiffness import Stiffness
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.padding import pad_length
@@ -160,7 +159,7 @@ def _compare_densities(nodes: FloatArray, times: FloatArray, counts: FloatArray)
     return np.asarray(2.0 / (1.0 + PARTS_OF_CELL * np.sort(np.diff(quarters), axis=1)[:, 1] / lengths))
 
 
-def _grade_nodes(nodes: FloatArray, step_times: FloatArray, steps: FloatArray, pieces: NDArray[np.intp]) -> FloatArray:
+def _grade_nodes(nodes: FloatArray, step_times: FloatArray, steps: FloatArray, pieces: IntArray) -> FloatArray:
     """Return the nodes that cut each cell between nodes (G + 1,) into its pieces (G,): half of them follow the density
     of the solver's steps, of which there are `steps` (K,) up to `step_times` (K,), half are even.
 
@@ -195,16 +194,16 @@ class MeshRows(NamedTuple):
     first_row, first_cell : (N + 1,) int, the row and the cell in which each segment begins
     """
 
-    segment: Any
-    cell: Any
-    opens: Any
-    start: Any
-    end: Any
-    first_row: Any
-    first_cell: Any
+    segment: Traced
+    cell: Traced
+    opens: Traced
+    start: Traced
+    end: Traced
+    first_row: Traced
+    first_cell: Traced
 
 
-def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> MeshRows:
+def build_rows(nodes: Traced, tau: Traced, side: Traced, xp: ArrayModule = jnp) -> MeshRows:
     """Cut the cells between `nodes` (G + 1,) at `tau` (N,).
 
     Where tau_i equals a node, `side` = +1 lets segment i begin in the cell after it, so that derivatives are those
@@ -235,6 +234,6 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> MeshRows:
     return MeshRows(segment, cell, opens, start, end, first_row, first_cell)
 
 
-def find_row_ending_cell(first_cell: Any, cell: Any, xp: Any = jnp) -> Any:
+def find_row_ending_cell(first_cell: Traced, cell: Traced, xp: ArrayModule = jnp) -> Traced:
     """Return the last row inside each of the given cells (K,), -1 for cell -1; segments begin in cells (N + 1,)."""
     return xp.where(cell < 0, -1, cell + (cell[:, None] >= first_cell[None, 1:]).sum(1))

@@ -24,10 +24,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.signals import Array, Piece
+from switchfit.discretization.signals import Piece
 from switchfit.discretization.tableaus import select_tableaus
 from switchfit.problem.functions import Function
 from switchfit.problem.losses import influence, robust

@@ -9,19 +9,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 
+from switchfit.arrays import Traced
 from switchfit.discretization.mesh import MeshRows
 from switchfit.discretization.model import Model, list_transition_functions
 from switchfit.discretization.propagation import Path, switch_mode
 from switchfit.discretization.sampled_states import see_samples
 from switchfit.discretization.signals import Piece
-from switchfit.discretization.steps import Array
 
 
 def compute_path_cost(model: Model, path: Path, p: Array) -> Array:
     """Return the cost J of the discretized system, of (2) and of the samples: ()."""
-    return integrate_running_cost(model, path, p) + add_sample_costs(model, path, p) + add_point_costs(model, path, p)
+    return integrate_running_cost(model, path, p) + _add_sample_costs(model, path, p) + add_point_costs(model, path, p)
 
 
 def compute_path_constraints(model: Model, path: Path, p: Array) -> Array:
@@ -45,7 +45,7 @@ def integrate_running_cost(model: Model, path: Path, p: Array) -> Array:
     return (weigh_stages(model, path.layout) * map_stages(model, path, ell, path.stages)).sum()
 
 
-def map_stages(model: Model, path: Path, function: Callable[..., Any], states: Array) -> Any:
+def map_stages(model: Model, path: Path, function: Callable[..., Any], states: Array) -> Traced:
     """Return the values ``function(mode, piece, t, x)`` at all stages: (R, s, ...); `states` are (R, s, n).
 
     The function may depend on the mode only by whether it is the rest after a free tf.
@@ -74,7 +74,7 @@ def add_point_costs(model: Model, path: Path, p: Array) -> Array:
     return total + model.terminal(path.after[-1], p)
 
 
-def add_sample_costs(model: Model, path: Path, p: Array) -> Array:
+def _add_sample_costs(model: Model, path: Path, p: Array) -> Array:
     """Return the sum of the costs of all discrete samples."""
     total = jnp.zeros(())
     for k in range(len(model.arguments.samples)):

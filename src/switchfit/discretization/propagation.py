@@ -6,16 +6,20 @@ It discretizes equation (1) of the paper by a scan over the rows; JAX differenti
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
-from jax import lax
+from jax import Array, lax
 
+from switchfit.arrays import Traced
 from switchfit.discretization.mesh import MeshRows, build_rows, find_row_ending_cell
 from switchfit.discretization.model import Model
+from switchfit.discretization.runge_kutta import Tableau
 from switchfit.discretization.signals import Piece
-from switchfit.discretization.steps import Array, step
-from switchfit.discretization.tableaus import EXPLICIT, STIFF_BESIDE_EXPLICIT, Tableau
+from switchfit.discretization.steps import step
+from switchfit.discretization.tableaus import EXPLICIT, STIFF_BESIDE_EXPLICIT
+
+Found = TypeVar("Found")
 
 
 class Path(NamedTuple):
@@ -52,7 +56,9 @@ def pick_at_cells(layout: MeshRows, before: Array, after: Array, cell: Array) ->
     return jnp.concatenate([before[:1], after])[find_row_ending_cell(layout.first_cell, cell) + 1]
 
 
-def switch_mode(model: Model, segment: Array | int, branch: Callable[[int], Callable[..., Any]], *operands: Any) -> Any:
+def switch_mode(
+    model: Model, segment: Array | int, branch: Callable[[int], Callable[..., Found]], *operands: Traced
+) -> Found:
     """Call ``branch(mode)(*operands)`` for the mode that is active in a segment, directly if there is only one."""
     count = len(model.structure.modes)
     if count == 1:
@@ -60,7 +66,9 @@ def switch_mode(model: Model, segment: Array | int, branch: Callable[[int], Call
     return lax.switch(model.mode_of_segment[segment], [branch(mode) for mode in range(count)], *operands)
 
 
-def switch_method(model: Model, segment: Array, branch: Callable[[Tableau], Callable[..., Any]], *operands: Any) -> Any:
+def switch_method(
+    model: Model, segment: Array, branch: Callable[[Tableau], Callable[..., Found]], *operands: Traced
+) -> Found:
     """Call ``branch(tableau)(*operands)`` for the method of the steps in a segment, directly if all modes have one.
 
     For what depends on the method alone: its program does not grow with the number of modes.
@@ -91,7 +99,7 @@ def propagate(model: Model, tau: Array, p: Array, side: Array, nudges: Array | N
     # only.
     def advance(x: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, nudge, *row = given
-        x = apply_reset(model, tau, x, p, segment, opens)
+        x = _apply_reset(model, tau, x, p, segment, opens)
         x = x if nudge is None else x + nudge
         after, *found = switch_mode(model, segment, through, *row, x)
         return after, (x, after, *found)
@@ -101,7 +109,7 @@ def propagate(model: Model, tau: Array, p: Array, side: Array, nudges: Array | N
     return Path(layout, pieces, *columns)
 
 
-def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, opens: Array) -> Array:
+def _apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, opens: Array) -> Array:
     """Return x(tau+), ``R(tau, x(tau-), p)`` where a row opens a segment whose transition has a reset map."""
     resets = model.structure.resets
     if not resets:

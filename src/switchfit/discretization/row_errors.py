@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from switchfit.discretization.rows import Array, Factorize, combine
+from switchfit.arrays import ArrayModule, Traced
+from switchfit.discretization.rows import Factorize, combine
 from switchfit.discretization.tableaus import STIFF_DAMPING, STIFF_ERROR
 
 LARGEST_BEND = 0.3
@@ -18,7 +18,7 @@ SMALLEST_BEND = 1e-4
 """Difference of the slopes, relative to the slope at the start of the row, below which it may be rounding."""
 
 
-def estimate_error(h: Array, k: Sequence[Array], slope: Array, f_x: Array, factorize: Factorize) -> Array:
+def estimate_error(h: Traced, k: Sequence[Traced], slope: Traced, f_x: Traced, factorize: Factorize) -> Traced:
     """Return an estimate of the error of an implicit row, (n,): Hairer and Wanner II, equation (IV.8.19).
 
     ``(I - h g D_1 f)^-1 g (h f + sum_j e_j k_j)``, of order 4, with f (n,) and D_1 f (n, n) at the start of the row.
@@ -28,7 +28,7 @@ def estimate_error(h: Array, k: Sequence[Array], slope: Array, f_x: Array, facto
     return error
 
 
-def measure_jump(first: Array, middle: Array, last: Array, bend: Array, smooth: Array, xp: Any) -> Array:
+def measure_jump(first: Traced, middle: Traced, last: Traced, bend: Traced, smooth: Traced, xp: ArrayModule) -> Traced:
     """Return h times the jump of f inside a row, (n,); 0 where f seems smooth.
 
     Parameters

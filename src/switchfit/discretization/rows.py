@@ -37,33 +37,33 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from switchfit.arrays import FloatArray
-from switchfit.discretization.tableaus import Tableau
-
-Array = Any
-"""A JAX array, or a NumPy array of nodes."""
+from switchfit.arrays import ArrayModule, FloatArray, Traced
+from switchfit.discretization.runge_kutta import Tableau
 
 SHORT_ROW = 1e-3
 """Length of a row, in times of the fastest component of f, below which its slopes are f at the stages."""
 
-Pull = Callable[[int, Array, Array], tuple[Array, Array, Array]]
+Pull = Callable[[int, Traced, Traced], tuple[Traced, Traced, Traced]]
 """``pull(j, w, hb)``: derivatives of ``w . f + hb ell`` at stage j in t (), x (n,) and p (M,)."""
+
+Factorize: TypeAlias = "Callable[[Traced, Traced, Sequence[Traced]], Factors]"
+"""Factorizes the matrix of the coupled equations: a (s, s), h and f_x (s arrays (n, n)), as in `couple`."""
 
 
 class Stages(NamedTuple):
     """Time (), state (n,) and slope (n,) of each stage: lists, or arrays with one more axis in front."""
 
-    times: Any
-    states: Any
-    slopes: Any
+    times: Traced
+    states: Traced
+    slopes: Traced
 
 
 def stages(
-    tableau: Tableau, f: Callable[..., Array], start: Array, end: Array, x: Array, increments: Sequence[Array] = ()
+    tableau: Tableau, f: Callable[..., Traced], start: Traced, end: Traced, x: Traced, increments: Sequence[Traced] = ()
 ) -> Stages:
     """Compute the stages of a row from the state x (n,); ``f(t, x)`` is the vector field.
 
@@ -82,16 +82,12 @@ def stages(
 class Factors(Protocol):
     """A factorized matrix of s by s blocks (n, n)."""
 
-    def solve(self, right: Sequence[Array], *, transposed: bool = False) -> list[Array]:
+    def solve(self, right: Sequence[Traced], *, transposed: bool = False) -> list[Traced]:
         """Return the solution for a right-hand side of s vectors (n,): s vectors (n,)."""
         ...
 
 
-Factorize = Callable[[Array, Array, Sequence[Array]], Factors]
-"""Factorizes the matrix of the coupled equations: a (s, s), h and f_x (s arrays (n, n)), as in `couple`."""
-
-
-def couple(a: Array, h: Array, f_x: Sequence[Array]) -> list[list[Array]]:
+def couple(a: Traced, h: Traced, f_x: Sequence[Traced]) -> list[list[Traced]]:
     """Return the matrix of the coupled equations, ``I - h a_jl D_1 f_j``, in s by s blocks (n, n)."""
     unit = np.eye(f_x[0].shape[0])
     return [
@@ -100,7 +96,7 @@ def couple(a: Array, h: Array, f_x: Sequence[Array]) -> list[list[Array]]:
     ]
 
 
-def choose_slopes(h: Array, k: Sequence[Array], f_X: Sequence[Array], f_x: Array, xp: Any) -> list[Array]:
+def choose_slopes(h: Traced, k: Sequence[Traced], f_X: Sequence[Traced], f_x: Traced, xp: ArrayModule) -> list[Traced]:
     """Return the slopes K of the stages, from the increments k, or f at the stages where the row is short.
 
     The stiff components of f amplify the rounding errors of X, those of k / h do not. But the second derivative of
@@ -122,19 +118,19 @@ def choose_slopes(h: Array, k: Sequence[Array], f_X: Sequence[Array], f_x: Array
 class Tangent(NamedTuple):
     """Derivatives along one direction: of the states and slopes of the stages, (n,) each, and of x+ (n,)."""
 
-    states: list[Array]
-    slopes: list[Array]
-    after: Array
+    states: list[Traced]
+    slopes: list[Traced]
+    after: Traced
 
 
 def tangent(
     tableau: Tableau,
-    h: Array,
-    slopes: Sequence[Array],
-    f_x: Sequence[Array],
-    forcing: Sequence[Array],
-    x_d: Array,
-    h_d: Array,
+    h: Traced,
+    slopes: Sequence[Traced],
+    f_x: Sequence[Traced],
+    forcing: Sequence[Traced],
+    x_d: Traced,
+    h_d: Traced,
     factors: Factors | None = None,
 ) -> Tangent:
     """Differentiate a row along one direction.
@@ -150,15 +146,15 @@ def tangent(
     factors : of the matrix of the coupled equations of an implicit row, with f_x; `adjoint` takes the same ones
     """
 
-    def follow(start: Array, weights: FloatArray, K_d: Sequence[Array]) -> Array:
+    def follow(start: Traced, weights: FloatArray, K_d: Sequence[Traced]) -> Traced:
         """Return ``start + h sum_l weights_l K_l' + h' sum_l weights_l K_l``."""
         moved = start + h * combine(weights, K_d) if K_d else start
         return moved if h_d is None else moved + h_d * combine(weights, slopes)
 
     # X_j' = x' + h sum_l a_jl K_l' + h' sum_l a_jl K_l: along p this discretizes the linear equation whose solution is
     # (10) of the paper.
-    states: list[Array] = []
-    K_d: list[Array] = []
+    states: list[Traced] = []
+    K_d: list[Traced] = []
     if factors is None:
         for J, given, row in zip(f_x, forcing, tableau.a, strict=True):
             states.append(follow(x_d, row, K_d))
@@ -182,22 +178,22 @@ class Adjoint(NamedTuple):
     parameters : (M,), the sum of the same in p
     """
 
-    states: list[Array]
-    before: Array
-    times: list[Array]
-    parameters: Array
+    states: list[Traced]
+    before: Traced
+    times: list[Traced]
+    parameters: Traced
 
 
 def adjoint(
-    tableau: Tableau, h: Array, psi: Array, pull: Pull, ell_x: Sequence[Array] = (), factors: Factors | None = None
+    tableau: Tableau, h: Traced, psi: Traced, pull: Pull, ell_x: Sequence[Traced] = (), factors: Factors | None = None
 ) -> Adjoint:
     """Pull the costate psi (n,) after a row back to its start; of an implicit row by its factors, and with D_1 ell at
     each stage, s arrays (n,).
     """
     a, b, s = tableau.a, tableau.b.tolist(), len(tableau.b)
-    unknown: list[list[Array]] = [[None] * s for _ in range(3)]
+    unknown: list[list[Traced]] = [[None] * s for _ in range(3)]
     w, mu, times = unknown
-    parameters: Array = 0.0
+    parameters: Traced = 0.0
     if factors is not None:
         # mu_l = D_1 f_l' w_l + h b_l D_1 ell_l put into w_j = h b_j psi + h sum_l a_lj mu_l leaves a system in w alone,
         # with the transposed matrix of the tangent:
@@ -217,13 +213,13 @@ def adjoint(
 
 
 def length_factor(
-    tableau: Tableau, psi: Array, mu: Sequence[Array], slopes: Sequence[Array], densities: Sequence[Array]
-) -> Array:
+    tableau: Tableau, psi: Traced, mu: Sequence[Traced], slopes: Sequence[Traced], densities: Sequence[Traced]
+) -> Traced:
     """Return V, the derivative of the cost to go in the length of a row at fixed times of its stages: ().
 
     V is linear in the slopes K_j (n,) and the densities ell_j (): with K_j' and ell_j' the result is its derivative.
     """
-    total: Array = 0.0
+    total: Traced = 0.0
     for j, b in enumerate(tableau.b.tolist()):
         # h stands in x+ and in the cost of the row, h b_j (K_j, ell_j), and in the states of the stages, h a_jl K_l.
         if b:
@@ -243,13 +239,13 @@ def invert_stages(tableau: Tableau) -> FloatArray:
     return np.asarray(np.linalg.inv(tableau.a if tableau.coupled else np.vstack([tableau.a[1:], tableau.b])))
 
 
-def times_derivative(tableau: Tableau, start_d: Array, end_d: Array) -> list[Array]:
+def times_derivative(tableau: Tableau, start_d: Traced, end_d: Traced) -> list[Traced]:
     """Return the derivatives of the times of the stages, ``start' + c_j h'``: s entries ()."""
     h_d = end_d - start_d
     return [start_d + c * h_d for c in tableau.c.tolist()]
 
 
-def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array] | FloatArray) -> Array:
+def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Traced] | FloatArray) -> Traced:
     """Add terms with weights; terms of weight zero are skipped, and the sum of no terms is 0.
 
     The terms may be one NumPy array, along its first axis.
@@ -261,6 +257,6 @@ def combine(weights: Sequence[float] | FloatArray, terms: Sequence[Array] | Floa
     return sum(parts[1:], parts[0]) if parts else 0.0
 
 
-def times_vector(A: Array, v: Array) -> Array:
+def times_vector(A: Traced, v: Traced) -> Traced:
     """Return ``A v`` for small A (m, n) and v (n,) as products and a sum, without the overhead of a library call."""
     return (A * v[None]).sum(-1)

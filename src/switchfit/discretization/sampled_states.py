@@ -11,13 +11,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+from jax import Array, lax
 
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import Path, switch_mode
 from switchfit.discretization.signals import Piece
-from switchfit.discretization.steps import Array, step
+from switchfit.discretization.steps import step
 
 
 def see_samples(model: Model, path: Path, k: int, p: Array) -> tuple[Samples, Array]:

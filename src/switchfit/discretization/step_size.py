@@ -13,12 +13,11 @@ Functions of one step take `xp`, the module for their arrays: NumPy, or the name
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.arrays import FloatArray
-from switchfit.discretization.rows import Array
+from switchfit.arrays import ArrayModule, FloatArray, Traced
 
 SAFETY, SMALLEST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 MACHINE_EPSILON, SMALLEST_DOUBLE = float(np.finfo(float).eps), float(np.nextafter(0.0, 1.0))
@@ -30,8 +29,8 @@ EXPONENT, STIFF_EXPONENT = -1 / 5, -1 / 4
 class Tolerances(NamedTuple):
     """Relative and absolute tolerance of a step: (), ()."""
 
-    rtol: Array
-    atol: Array
+    rtol: Traced
+    atol: Traced
 
 
 class Progress(NamedTuple):
@@ -45,42 +44,49 @@ class Progress(NamedTuple):
     stuck : whether the next step would not change t, or is NaN: the solve has failed
     """
 
-    t: Array
-    step: Array
-    refused: Array
-    stuck: Array
+    t: Traced
+    step: Traced
+    refused: Traced
+    stuck: Traced
 
 
-def error_norm(error: Array, y: Array, after: Array, tolerances: Tolerances, xp: Any = np) -> Array:
+def _measure_error(error: Traced, y: Traced, after: Traced, tolerances: Tolerances, xp: ArrayModule = np) -> Traced:
     """Return the root mean square of an error (n,), relative to the tolerances for a step from y to `after`."""
     relative = error / (tolerances.atol + tolerances.rtol * xp.maximum(xp.abs(y), xp.abs(after)))
     return xp.sqrt((relative * relative).sum() / len(y))
 
 
-def shortest_step(t: Array, xp: Any = np) -> Array:
+def _shortest_step(t: Traced, xp: ArrayModule = np) -> Traced:
     """Return the shortest step to try at t: about ten units in the last place."""
     return xp.maximum(10.0 * MACHINE_EPSILON * xp.abs(t), 10.0 * SMALLEST_DOUBLE)
 
 
-def limit_step(t: Array, step: Array, end: Array, xp: Any = np) -> Array:
+def limit_step(t: Traced, step: Traced, end: Traced, xp: ArrayModule = np) -> Traced:
     """Return the step, shortened so that it does not pass the end."""
     return xp.where(end <= t + step, end - t, step)
 
 
 def judge_error(
-    at: Progress, end: Array, tolerances: Tolerances, y: Array, after: Array, error: Array, exponent: float, xp: Any
-) -> tuple[Progress, Array]:
+    at: Progress,
+    end: Traced,
+    tolerances: Tolerances,
+    y: Traced,
+    after: Traced,
+    error: Traced,
+    exponent: float,
+    xp: ArrayModule,
+) -> tuple[Progress, Traced]:
     """Accept or reject a step from y to `after`, (n,) each, with an error (n,); choose the size of the next one."""
-    norm = error_norm(error, y, after, tolerances, xp)
+    norm = _measure_error(error, y, after, tolerances, xp)
     accepted = norm < 1.0
     # h+ = h min(largest, max(0.2, 0.9 norm^(-1/q))), q the order of the error; after a rejection it does not grow.
     largest = xp.where(at.refused, 1.0, LARGEST_FACTOR)
     factor = xp.minimum(xp.maximum(SAFETY * xp.float_power(norm, exponent), SMALLEST_FACTOR), largest)
     step = at.step * xp.where(norm >= 0.0, factor, SMALLEST_FACTOR)  # comparisons with a NaN norm are false
     # Comparisons with a NaN step size are false: the solve is stuck, instead of trying for ever.
-    stuck = ~(accepted | (shortest_step(at.t, xp) <= step))
+    stuck = ~(accepted | (_shortest_step(at.t, xp) <= step))
     t = xp.where(accepted, xp.where(end - at.t <= at.step, end, at.t + at.step), at.t)
-    step = xp.where(accepted, xp.maximum(step, shortest_step(t, xp)), step)
+    step = xp.where(accepted, xp.maximum(step, _shortest_step(t, xp)), step)
     now = Progress(t, limit_step(t, step, end, xp), ~accepted, stuck)
     return now, xp.where(accepted, after, y)
 
@@ -96,7 +102,7 @@ def first_step(
     with np.errstate(all="ignore"):
         if not np.isfinite(K).all():
             return np.nan
-        of_state, of_slope = (float(error_norm(each, y, y, tolerances)) for each in (y, K))
+        of_state, of_slope = (float(_measure_error(each, y, y, tolerances)) for each in (y, K))
         if not np.isfinite(of_slope):  # its square overflows: the first step will fail, with a message
             return min(1e-6, end - t)
         # An Euler step h_0 that moves y by 1 % of its size, then h_1 from (h_1)^q max(|f|, |df| / h_0) = 0.01: the
@@ -105,8 +111,8 @@ def first_step(
         step = 0.0
         if guess > 0.0:
             ahead = min(t + guess, float(np.nextafter(end, t)))
-            bend = float(error_norm(slope(ahead, y + guess * K) - K, y, y, tolerances)) / guess
+            bend = float(_measure_error(slope(ahead, y + guess * K) - K, y, y, tolerances)) / guess
             flat = of_slope <= 1e-15 and bend <= 1e-15
             step = max(1e-6, guess * 1e-3) if flat else (0.01 / max(of_slope, bend)) ** -exponent
         step = min(100.0 * guess, step)
-        return float(limit_step(t, max(step, float(shortest_step(t))), end))
+        return float(limit_step(t, max(step, float(_shortest_step(t))), end))

@@ -12,14 +12,12 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 
 from switchfit.discretization import rows
 from switchfit.discretization.model import Field
 from switchfit.discretization.rows import combine
-from switchfit.discretization.tableaus import Tableau
-
-Array = jax.Array
+from switchfit.discretization.runge_kutta import Tableau
 
 Slope = Callable[[Array, Array], Array]
 """``f(t, x) -> (n,)``: a vector field at one p."""

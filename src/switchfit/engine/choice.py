@@ -7,6 +7,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from jax import Array
+
 from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
@@ -115,8 +117,8 @@ def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments
 
 
 def derivatives_inside_program(
-    structure: Structure, arguments: Arguments, tau: Any, p: Any, side: Any, places: Mapping[str, Any]
-) -> Any:
+    structure: Structure, arguments: Arguments, tau: Array, p: Array, side: Array, places: Mapping[str, Any]
+) -> tuple[Array, Array, Array]:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a JAX program.
 
     `side` is +1 or -1: the right or left derivative in a transition time that lies on a node. With the `places` of
@@ -124,5 +126,7 @@ def derivatives_inside_program(
     and one program serves all its sequences. Without any, JAX does.
     """
     if places:
-        return foreign_derivatives(structure, arguments, tau, p, side, places)
-    return derivatives(arguments, tau, p, side, structure=structure, method="discrete-adjoint")
+        J, g, H = foreign_derivatives(structure, arguments, tau, p, side, places)
+    else:
+        J, g, H = derivatives(arguments, tau, p, side, structure=structure, method="discrete-adjoint")
+    return J, g, H

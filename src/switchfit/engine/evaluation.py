@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Generic, Literal, TypeVar
+from typing import Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,9 @@ Matrix = Literal["exact", "gauss-newton", "none"]
 """What to return as the Hessian: the exact one, the Gauss-Newton matrix, or NaN."""
 
 H_co = TypeVar("H_co", covariant=True)
+
+DenseEvaluation: TypeAlias = "Evaluation[FloatArray]"
+"""With the Hessian as an array."""
 
 
 def build_undefined_evaluation(D: int, m: int, row_errors: tuple[float, ...] = ()) -> DenseEvaluation:
@@ -95,7 +98,3 @@ class Evaluation(Generic[H_co]):
 
     def __repr__(self) -> str:
         return format_line(self, f"J = {self.cost:.9g}", f"{len(self.gradient)} unknowns")
-
-
-DenseEvaluation = Evaluation[FloatArray]
-"""With the Hessian as an array."""

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, IntArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import find_row_ending_cell
 from switchfit.problem.structure import Structure
@@ -42,7 +41,7 @@ class Simulation:
 
     cost: float
     nodes: FloatArray
-    first_cell: NDArray[np.intp]
+    first_cell: IntArray
     start: FloatArray
     end: FloatArray
     before: FloatArray
@@ -53,7 +52,7 @@ class Simulation:
     tangents: Tangents | None = None
 
     @property
-    def first_row(self) -> NDArray[np.intp]:
+    def first_row(self) -> IntArray:
         """The row in which each segment begins."""
         return self.first_cell + np.arange(len(self.first_cell))
 
@@ -63,7 +62,7 @@ class Simulation:
         first = self.first_row.tolist()
         return [slice(a, b) for a, b in zip(first, [*first[1:], len(self.start)], strict=True)]
 
-    def row_ending(self, cells: NDArray[np.intp]) -> NDArray[np.intp]:
+    def row_ending(self, cells: IntArray) -> IntArray:
         """Return the last row that ends in each of the cells (K,), before any jump at its end; -1 for cell -1."""
         return np.asarray(find_row_ending_cell(self.first_cell, cells, np))
 
@@ -91,13 +90,13 @@ class Costates(NamedTuple):
     """
 
     times: FloatArray
-    cells: NDArray[np.intp]
-    modes: NDArray[np.intp]
+    cells: IntArray
+    modes: IntArray
     states: FloatArray
     costates: FloatArray
 
     @classmethod
-    def of_rows(cls, structure: Structure, first_row: NDArray[np.intp], *rows: FloatArray) -> Costates:
+    def of_rows(cls, structure: Structure, first_row: IntArray, *rows: FloatArray) -> Costates:
         """Return the costates of rows, given the times (R,), states and costates at their starts (R, n), without those
         after a free tf; `first_row` is that of each segment.
         """

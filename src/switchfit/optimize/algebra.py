@@ -8,14 +8,10 @@ traced; there the two programs differ, and `switchfit.optimize.traced` says at e
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from switchfit.arrays import FloatArray
-
-Array = Any
-"""An array of NumPy or of JAX."""
+from switchfit.arrays import ArrayModule, FloatArray, Traced
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -86,13 +82,13 @@ def smallest(vector: FloatArray) -> float:
 # --- constraints at a point -------------------------------------------------------------------------------------------
 
 
-def slack(constraints: Any, theta: Array, xp: Any = np) -> Array:
+def slack(constraints: Traced, theta: Traced, xp: ArrayModule = np) -> Traced:
     """Return how far theta (d,) is inside rows, lower and upper bounds: (m + 2 d,); negative where violated."""
     rows = constraints.A.dot(theta) - constraints.b
     return xp.concatenate([rows, theta - constraints.lower, constraints.upper - theta])
 
 
-def is_active(slack: Array, size: Array, abs_A: Array, abs_b: Array, xp: Any = np) -> Array:
+def is_active(slack: Traced, size: Traced, abs_A: Traced, abs_b: Traced, xp: ArrayModule = np) -> Traced:
     """Return which constraints hold with equality up to the rounding of the rows: (m + 2 d,) of bool.
 
     Parameters
@@ -107,7 +103,9 @@ def is_active(slack: Array, size: Array, abs_A: Array, abs_b: Array, xp: Any = n
     return slack <= xp.concatenate([rounding, xp.zeros(2 * size.shape[0])])
 
 
-def project_on_row(theta: Array, normal: Array, bound: Array, movable: Array, xp: Any = np) -> tuple[Array, Array]:
+def project_on_row(
+    theta: Traced, normal: Traced, bound: Traced, movable: Traced, xp: ArrayModule = np
+) -> tuple[Traced, Traced]:
     """Return the violation of the row ``normal . theta >= bound``, and theta moved onto it, an ulp to its inside.
 
     Parameters
@@ -123,7 +121,7 @@ def project_on_row(theta: Array, normal: Array, bound: Array, movable: Array, xp
     return violation, theta + movable * ((violation + margin) / xp.where(square > 0.0, square, 1.0))
 
 
-def unit_rows(rows: Array, xp: Any = np) -> tuple[Array, Array]:
+def unit_rows(rows: Traced, xp: ArrayModule = np) -> tuple[Traced, Traced]:
     """Return rows (k, d) of unit length, and their lengths (k,); a row of zeros stays one, with the length 1."""
     lengths = xp.sqrt((rows * rows).sum(1))
     lengths = xp.where(lengths > 0.0, lengths, 1.0)
@@ -133,14 +131,14 @@ def unit_rows(rows: Array, xp: Any = np) -> tuple[Array, Array]:
 # --- scales -----------------------------------------------------------------------------------------------------------
 
 
-def _replace_small(scale: Array, least: float, other: float, xp: Any) -> Array:
+def _replace_small(scale: Traced, least: float, other: float, xp: ArrayModule) -> Traced:
     """Return sizes (d,) with `other` in place of those that are not above the least."""
     if xp is np and smallest(scale) > least:  # mostly, and four times faster
         return scale
     return xp.where(scale > least, scale, other)
 
 
-def flatness(scale: Array, cost_scale: Array, xp: Any = np) -> Array:
+def flatness(scale: Traced, cost_scale: Traced, xp: ArrayModule = np) -> Traced:
     """Return diagonal Hessian entries so small that changing an unknown by its size changes J by rounding only: (d,).
 
     Parameters
@@ -154,7 +152,7 @@ def flatness(scale: Array, cost_scale: Array, xp: Any = np) -> Array:
     return (EPS * cost_scale) / (size * size)
 
 
-def curvature_floor(scale: Array, cost_scale: Array, slopes: Array, xp: Any = np) -> Array:
+def curvature_floor(scale: Traced, cost_scale: Traced, slopes: Traced, xp: ArrayModule = np) -> Traced:
     """Return the curvature below which an unknown's counts as none: (d,).
 
     Where J is nearly linear in an unknown, with a derivative of the size `slopes` (d,), its step is limited too.
@@ -163,34 +161,34 @@ def curvature_floor(scale: Array, cost_scale: Array, slopes: Array, xp: Any = np
     return xp.maximum(flatness(scale, cost_scale, xp), slopes / (LONGEST_STEP * size))
 
 
-def jacobi_scaling(diagonal: Array, largest_in_rows: Array, xp: Any = np) -> Array:
+def jacobi_scaling(diagonal: Traced, largest_in_rows: Traced, xp: ArrayModule = np) -> Traced:
     """Return the root of a matrix's diagonal (d,); where it is not positive, of the row's largest entry, or 1: (d,)."""
     square = xp.where(diagonal > 0.0, diagonal, xp.where(largest_in_rows > 0.0, largest_in_rows, 1.0))
     return xp.sqrt(square)
 
 
-def equilibrate(scaling: Array, largest_in_rows: Array, xp: Any = np) -> Array:
+def equilibrate(scaling: Traced, largest_in_rows: Traced, xp: ArrayModule = np) -> Traced:
     """Return a scaling (d,) grown where the rows of the matrix scaled by it have entries above 1."""
     return scaling * xp.sqrt(xp.maximum(largest_in_rows, 1.0))
 
 
-def positive_eigenvalues(values: Array, xp: Any = np) -> Array:
+def positive_eigenvalues(values: Traced, xp: ArrayModule = np) -> Traced:
     """Return eigenvalues with those that are not positive replaced by their absolute values, or more."""
     replaced = xp.maximum(xp.abs(values), EIGENVALUE_REPLACEMENT)
     return xp.where(values > EIGENVALUE_FLOOR, values, replaced)
 
 
-def is_negligible(step: Array, scale: Array, xp: Any = np) -> Any:
+def is_negligible(step: Traced, scale: Traced, xp: ArrayModule = np) -> Traced:
     """Return whether a step (d,) is negligible beside unknowns of the size (d,)."""
     return xp.all(xp.abs(step) <= NEGLIGIBLE_STEP * scale)
 
 
-def mix_sides(right: Array, left: Array, sides: Array, xp: Any = np) -> Array:
+def mix_sides(right: Traced, left: Traced, sides: Traced, xp: ArrayModule = np) -> Traced:
     """Return what is found on the right where the side is positive, on the left where it is negative, else the mean."""
     return xp.where(sides > 0, right, xp.where(sides < 0, left, 0.5 * (right + left)))
 
 
-def find_least_jump(curvature: Array, slopes: Any, cost: Any, xp: Any = np) -> Array:
+def find_least_jump(curvature: Traced, slopes: Traced, cost: Traced, xp: ArrayModule = np) -> Traced:
     """Return by how much a derivative of J jumps at least at a kink that holds an unknown: (d,).
 
     Smaller jumps are rounding, or what integration makes at nodes that are no kinks of the model: without the jump J
@@ -206,7 +204,7 @@ def find_least_jump(curvature: Array, slopes: Any, cost: Any, xp: Any = np) -> A
     return xp.maximum(SMALLEST_JUMP * slopes, xp.sqrt(2.0 * COST_NOISE * xp.abs(cost) * xp.fmax(curvature, 0.0)))
 
 
-def choose_sides(left: Array, right: Array, xp: Any = np) -> Array:
+def choose_sides(left: Traced, right: Traced, xp: ArrayModule = np) -> Traced:
     """Return the side to which each coordinate at a kink descends by itself, given its derivatives (d,): (d,) int.
 
     It is held, 0, where 0 is in [g₋, g₊]; else it goes where the descent is steeper, −g₊ to the right and g₋ to the
@@ -220,7 +218,9 @@ def choose_sides(left: Array, right: Array, xp: Any = np) -> Array:
 # then a smaller KKT residual counts, or a cost below every earlier one.
 
 
-def cost_allows(cost: Any, before: Any, lowest: Any, decrease: Any, noise: Any, fraction: Any) -> Any:
+def cost_allows(
+    cost: Traced, before: Traced, lowest: Traced, decrease: Traced, noise: Traced, fraction: Traced
+) -> Traced:
     """Return whether a trial's cost allows it, its optimality aside.
 
     Parameters
@@ -235,6 +235,8 @@ def cost_allows(cost: Any, before: Any, lowest: Any, decrease: Any, noise: Any, 
     return (cost <= lowest + noise) & ((decrease <= noise) | (cost <= before - fraction * decrease))
 
 
-def optimality_allows(optimality: Any, before: Any, cost: Any, lowest: Any, decrease: Any, noise: Any) -> Any:
+def optimality_allows(
+    optimality: Traced, before: Traced, cost: Traced, lowest: Traced, decrease: Traced, noise: Traced
+) -> Traced:
     """Return whether a trial's optimality allows it: it has to fall where costs are not compared."""
     return (decrease > noise) | (optimality < before) | (cost < lowest)

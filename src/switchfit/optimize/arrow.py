@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -29,6 +30,9 @@ from switchfit.optimize.dense import Dense
 from switchfit.optimize.positive_definite import STIFFENINGS, compose
 from switchfit.optimize.qp import Room
 from switchfit.optimize.symmetric_matrix import SymmetricMatrix, diagonal_scaling
+
+Hessian: TypeAlias = "Dense | Arrow"
+"""What the SQP takes for H: nothing in it asks which of the two it has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,9 +253,6 @@ class Arrow(SymmetricMatrix):
             return Spectrum(np.inf, np.zeros(len(held)))
 
         return FreeCurvature(np.eye(len(held))[:, ~left_out], find_spectrum)
-
-
-Hessian = Dense | Arrow
 
 
 @dataclass(frozen=True, eq=False)

@@ -102,7 +102,7 @@ def is_definite(matrix: FloatArray) -> bool:
     return not lapack.dpotrf(matrix, lower=1)[1]
 
 
-def add_to_diagonal(matrix: FloatArray, amount: float) -> FloatArray:
+def _add_to_diagonal(matrix: FloatArray, amount: float) -> FloatArray:
     """Return the matrix with an amount added to each entry of its diagonal."""
     changed = matrix.copy()
     changed.reshape(-1)[:: len(matrix) + 1] += amount
@@ -111,7 +111,7 @@ def add_to_diagonal(matrix: FloatArray, amount: float) -> FloatArray:
 
 def has_curvature(scaled: FloatArray) -> bool:
     """Return whether all eigenvalues of a scaled matrix are above `algebra.EIGENVALUE_FLOOR`."""
-    return is_definite(add_to_diagonal(scaled, -algebra.EIGENVALUE_FLOOR))
+    return is_definite(_add_to_diagonal(scaled, -algebra.EIGENVALUE_FLOOR))
 
 
 def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArray, bool]:
@@ -125,4 +125,4 @@ def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArra
     if lowest > margin:
         return symmetric, True
     margin = margin or algebra.EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
-    return add_to_diagonal(symmetric, margin - EIGENVALUE_SHIFT * min(lowest, 0.0)), False
+    return _add_to_diagonal(symmetric, margin - EIGENVALUE_SHIFT * min(lowest, 0.0)), False

@@ -12,7 +12,7 @@ in which nothing has a scale any more (`least_distance`).
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -28,6 +28,18 @@ SHORT_STEP = 0.01
 OUTSIDE = 1e-8
 """Part of a step by which it may leave the room. The tolerance of daqp is one in the metric of the matrix: a million
 times as much along directions in which that is nearly flat."""
+
+
+class _Product(Protocol):
+    """A matrix B, full or in parts, by its products."""
+
+    def dot(self, vector: FloatArray, /) -> FloatArray: ...
+
+
+class _Solver(Protocol):
+    """A factorization of B, of a full matrix or of one in parts."""
+
+    def solve(self, vector: FloatArray, /) -> FloatArray: ...
 
 
 class Room(NamedTuple):
@@ -83,7 +95,7 @@ class Room(NamedTuple):
         (lower, upper), own = self.bounds, pull[-step.size :]
         return np.minimum(np.maximum(np.where(own > 0.0, lower, np.where(own < 0.0, upper, step)), lower), upper)
 
-    def move_inside(self, step: FloatArray) -> FloatArray:
+    def _move_inside(self, step: FloatArray) -> FloatArray:
         """Return the step (d,) inside that is nearest to one: itself, unless it leaves by more than `OUTSIDE`."""
         products, size = self.normals.dot(step), algebra.largest(np.abs(step))
         if max(algebra.largest(self.lower - products), algebra.largest(products - self.upper)) <= OUTSIDE * size:
@@ -94,7 +106,7 @@ class Room(NamedTuple):
         return np.zeros(step.size) if found is None else np.clip(step + size * found[0], *self.bounds)
 
 
-def newton_step(gradient: FloatArray, matrix: Any, factor: Any) -> FloatArray:
+def newton_step(gradient: FloatArray, matrix: _Product, factor: _Solver) -> FloatArray:
     """Return −B⁻¹g (d,), refined once: the residual is computed with B itself, not with its factor."""
     step = -factor.solve(gradient)
     step -= factor.solve(gradient + matrix.dot(step))
@@ -134,7 +146,7 @@ def solve_programme(
         if refined is not None:
             e, pull = e + refined[0], np.where(active, pull + refined[1], 0.0)
     pull = length * pull / lengths
-    return room.move_inside(room.press(length * factor.unwhiten(e), pull)), pull
+    return room._move_inside(room.press(length * factor.unwhiten(e), pull)), pull
 
 
 def solve_in_span(

@@ -7,13 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from switchfit.arrays import FloatArray
 from switchfit.optimize.curvature import FreeCurvature
 from switchfit.optimize.status import Status
+
+Explain: TypeAlias = "Callable[[], LineSearchFailure]"
+"""Finds out why a line search failed, when that is asked for."""
+
+Callback: TypeAlias = "Callable[[IterationRecord], object]"
+"""Gets each `IterationRecord`; a true return value stops the minimization."""
 
 
 class LineSearchFailure(NamedTuple):
@@ -33,10 +39,6 @@ class LineSearchFailure(NamedTuple):
     kind: Literal["wrong slope", "jump", "kink", "not finite", "rounding", "valley"]
     figures: Mapping[str, float]
     places: tuple[tuple[int, float], ...] = ()
-
-
-Explain = Callable[[], LineSearchFailure]
-"""Finds out why a line search failed, when that is asked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +67,6 @@ class IterationRecord:
         if last is None:
             return self
         return replace(self, iteration=self.iteration + last.iteration, evaluations=self.evaluations + last.evaluations)
-
-
-Callback = Callable[[IterationRecord], object]
-"""Gets each `IterationRecord`; a true return value stops the minimization."""
 
 
 @dataclass(frozen=True, eq=False)

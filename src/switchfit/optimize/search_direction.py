@@ -96,7 +96,7 @@ def _solve_on_sides(
     labels = np.arange(d, dtype=float) if state.careful else problem.labels
     # Curvature of each unknown that counts as none.
     floor = algebra.curvature_floor(state.scale, state.cost_scale, point.largest_slopes)
-    matrix: Any = hessian
+    matrix: Any = hessian  # a full matrix or an arrow, each of which solves with the factor that it has returned itself
     descends = _descends(problem, hessian, free)
     if descends:
         matrix, floor = Dense(np.eye(d) / state.metric), np.zeros(d)

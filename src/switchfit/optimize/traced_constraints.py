@@ -11,9 +11,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
-from switchfit.arrays import IntArray
+from switchfit.arrays import IntArray, Traced
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import Array
 
 
 class TracedConstraints(NamedTuple):
@@ -22,14 +21,14 @@ class TracedConstraints(NamedTuple):
     `size` (d,) is the typical size of each unknown, of which rounding is a part, as of `minimize`.
     """
 
-    A: Array
-    b: Array
-    lower: Array
-    upper: Array
-    size: Array | float = 0.0
+    A: Traced
+    b: Traced
+    lower: Traced
+    upper: Traced
+    size: Traced | float = 0.0
 
     @property
-    def normals(self) -> Array:
+    def normals(self) -> Traced:
         """Inward normals of rows, lower and upper bounds: (m + 2 d, d)."""
         identity = jnp.eye(self.lower.shape[0])
         return jnp.concatenate([self.A, identity, -identity])
@@ -47,32 +46,32 @@ class TracedBreakpoints(NamedTuple):
     """
 
     coordinates: IntArray
-    points: Array
+    points: Traced
 
-    def rank(self, theta: Array) -> tuple[Array, Array]:
+    def _rank(self, theta: Traced) -> tuple[Traced, Traced]:
         """Return how many breakpoints lie below each of the coordinates, and how many below or on it: (k,), (k,)."""
         x = theta[self.coordinates, None]
         return jnp.sum(self.points < x, axis=1), jnp.sum(self.points <= x, axis=1)
 
-    def on_one(self, theta: Array) -> Array:
+    def on_one(self, theta: Traced) -> Traced:
         """Return which coordinates sit exactly on a breakpoint: (d,) of bool."""
-        below, up_to = self.rank(theta)
+        below, up_to = self._rank(theta)
         return jnp.zeros(theta.shape, bool).at[self.coordinates].set(up_to > below)
 
-    def count_crossed(self, theta: Array, to: Array) -> Array:
+    def count_crossed(self, theta: Traced, to: Traced) -> Traced:
         """Return the largest number of breakpoints strictly between two points in one coordinate."""
-        below, up_to = self.rank(theta)
-        below_to, up_to_to = self.rank(to)
+        below, up_to = self._rank(theta)
+        below_to, up_to_to = self._rank(to)
         return jnp.max(jnp.maximum(below_to - up_to, below - up_to_to), initial=0)
 
-    def piece(self, theta: Array, constraints: TracedConstraints) -> tuple[Array, Array]:
+    def piece(self, theta: Traced, constraints: TracedConstraints) -> tuple[Traced, Traced]:
         """Return the bounds (d,), (d,) narrowed to the next breakpoint on either side of theta."""
         where, x = self.coordinates, theta[self.coordinates, None]
         below = jnp.max(jnp.where(self.points < x, self.points, -jnp.inf), axis=1, initial=-jnp.inf)
         above = jnp.min(jnp.where(self.points > x, self.points, jnp.inf), axis=1, initial=jnp.inf)
         return constraints.lower.at[where].max(below), constraints.upper.at[where].min(above)
 
-    def snap(self, moved: Array, theta: Array, step: Array, size: Array) -> Array:
+    def snap(self, moved: Traced, theta: Traced, step: Traced, size: Traced) -> Traced:
         """Return ``moved = theta + step``, exactly on the breakpoints that it reaches up to rounding: (d,)."""
         where, x = self.coordinates, moved[self.coordinates]
         # A sum of floats that should be a breakpoint misses it by an ulp or two, and would count as beside it for ever:
@@ -84,17 +83,17 @@ class TracedBreakpoints(NamedTuple):
         return moved.at[where].set(jnp.where(jnp.abs(mark - x) <= rounding[where], mark, x))
 
 
-def find_active(constraints: TracedConstraints, theta: Array, scale: Array) -> Array:
+def find_active(constraints: TracedConstraints, theta: Traced, scale: Traced) -> Traced:
     """Return which constraints hold with equality up to rounding: (m + 2 d,) bool."""
     size = jnp.maximum(jnp.maximum(scale, constraints.size), jnp.abs(theta))
     slack = algebra.slack(constraints, theta, jnp)
     return algebra.is_active(slack, size, jnp.abs(constraints.A), jnp.abs(constraints.b), jnp)
 
 
-def move_traced(constraints: TracedConstraints, breakpoints: TracedBreakpoints, theta: Array, step: Array) -> Array:
+def move_traced(constraints: TracedConstraints, breakpoints: TracedBreakpoints, theta: Traced, step: Traced) -> Traced:
     """Return theta + step, on the breakpoints that it reaches, with violations of the size of rounding removed."""
 
-    def project(i: int, moved: Array) -> Array:
+    def project(i: int, moved: Traced) -> Traced:
         normal, bound = constraints.A[i], constraints.b[i]
         # A step of the programme ends on a row up to rounding: what is outside by that much is moved onto it, row by
         # row.

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from switchfit.arrays import Traced
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import Array
 from switchfit.optimize.traced_constraints import TracedBreakpoints, TracedConstraints, find_active
 from switchfit.optimize.traced_state import TracedState
 
@@ -21,17 +21,17 @@ DUAL_RIDGE = 1e-14
 """Added to the diagonal of the dual programme, whose rows are of unit length: constraints may depend on one another."""
 
 
-def hold_coordinates(held: Array, hessian: Array) -> Array:
+def hold_coordinates(held: Traced, hessian: Traced) -> Traced:
     """Return the Hessian (d, d) with rows and columns of the identity for coordinates that are held."""
     either = held[:, None] | held[None]
     return jnp.where(either, jnp.eye(held.shape[0]), hessian)
 
 
-def measure_kkt_residual(constraints: TracedConstraints, theta: Array, scale: Array, gradient: Array) -> Array:
+def measure_kkt_residual(constraints: TracedConstraints, theta: Traced, scale: Traced, gradient: Traced) -> Traced:
     """Return min over lam >= 0, on the active constraints, of ‖g − Nᵀ lam‖."""
     active = find_active(constraints, theta, scale)
 
-    def solve_constrained() -> Array:
+    def solve_constrained() -> Traced:
         # ||g - N' lam||^2 / 2 is lam' N N' lam / 2 - (N g)' lam up to a constant. The gradient is scaled to 1, since
         # `nonnegative_minimum` compares slopes with an absolute floor.
         normals, _ = algebra.unit_rows(constraints.normals, jnp)
@@ -42,7 +42,7 @@ def measure_kkt_residual(constraints: TracedConstraints, theta: Array, scale: Ar
     return lax.cond(jnp.any(active), solve_constrained, lambda: jnp.linalg.norm(gradient))
 
 
-def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
+def nonnegative_minimum(matrix: Traced, vector: Traced, allowed: Traced) -> Traced:
     """Minimize ½ lamᵀ M lam + vᵀ lam over lam >= 0 with zeros outside `allowed`: (k,).
 
     Lawson and Hanson's active-set method with masks in place of index sets: the set of positive entries grows by the
@@ -61,12 +61,12 @@ def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
     floor = -1e-13 * jnp.maximum(1.0, jnp.max(jnp.abs(vector), initial=0.0))
 
     # M_PP lam_P = -v_P on the positive set P, all other rows being those of the identity: one shape for every set.
-    def solve_on(positive: Array) -> Array:
+    def solve_on(positive: Traced) -> Traced:
         both = positive[:, None] & positive[None, :]
         diagonal = jnp.where(positive, DUAL_RIDGE, 1.0)
         return jnp.linalg.solve(jnp.where(both, matrix, 0.0) + jnp.diag(diagonal), jnp.where(positive, -vector, 0.0))
 
-    def body(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def body(state: tuple[Traced, Traced, Traced, Traced]) -> tuple[Traced, Traced, Traced, Traced]:
         lam, positive, count, _ = state
         target = solve_on(positive)
         # As far towards the minimum on P as lam stays nonnegative; what reaches zero first leaves P.
@@ -88,19 +88,19 @@ def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
     return lax.while_loop(lambda state: ~state[3] & (state[2] < 3 * k + 10), body, start)[0]
 
 
-def compute_scaling(hessian: Array, floor: Array) -> Array:
+def compute_scaling(hessian: Traced, floor: Traced) -> Traced:
     """Scale as `switchfit.optimize.symmetric_matrix.diagonal_scaling` does: (d,)."""
     size = jnp.abs(hessian)
 
-    def equilibrate(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def equilibrate(state: tuple[Traced, Traced, Traced]) -> tuple[Traced, Traced, Traced]:
         rounds, scaling, largest = state
         grown = algebra.equilibrate(scaling, largest, jnp)
         return rounds + 1, grown, find_largest(grown)
 
-    def find_largest(scaling: Array) -> Array:
+    def find_largest(scaling: Traced) -> Traced:
         return jnp.max(size / jnp.outer(scaling, scaling), axis=1)
 
-    def go_on(state: tuple[Array, Array, Array]) -> Array:
+    def go_on(state: tuple[Traced, Traced, Traced]) -> Traced:
         return (state[0] < algebra.EQUILIBRATIONS) & jnp.any(state[2] > algebra.EQUILIBRATED)
 
     # Rounds as in `diagonal_scaling`; a positive definite matrix needs none of them.
@@ -110,7 +110,7 @@ def compute_scaling(hessian: Array, floor: Array) -> Array:
 
 def find_traced_direction(
     state: TracedState, constraints: TracedConstraints, breakpoints: TracedBreakpoints
-) -> tuple[Array, Array]:
+) -> tuple[Traced, Traced]:
     """Return the step (d,) of the quadratic programme, with kinks held or confined to one side, and its slope gᵀd."""
     point, theta, sides = state.point, state.point.theta, state.point.sides
     # The Hessian of the piece that the sides lead into; entries between one coordinate on its left and another on its
@@ -130,7 +130,7 @@ def find_traced_direction(
     definite = jnp.all(jnp.isfinite(jnp.linalg.cholesky(scaled - algebra.EIGENVALUE_FLOOR * identity)))
 
     # |S| = V |Lambda| V': a step that descends along negative curvature, as long as it would be along positive.
-    def absolute() -> Array:
+    def absolute() -> Traced:
         values, vectors = jnp.linalg.eigh(scaled)
         return (vectors * algebra.positive_eigenvalues(values, jnp)[None]) @ vectors.T
 
@@ -142,14 +142,14 @@ def find_traced_direction(
     slack = jnp.maximum(constraints.A @ theta - constraints.b, 0.0)
     offsets = jnp.concatenate([-slack, low, -high])
 
-    def solve(right: Array) -> Array:
+    def solve(right: Traced) -> Traced:
         return jax.scipy.linalg.cho_solve((factor, True), right / scaling) / scaling
 
     newton = -solve(gradient)
     # Refined once: the residual is computed with B itself, not with its factor.
     newton = newton - solve(gradient + scaling * (matrix @ (scaling * newton)))
 
-    def solve_constrained() -> Array:
+    def solve_constrained() -> Traced:
         # In white variables e = Lᵀ D d: minimize ½‖e − e_0‖² subject to G e >= c with unit rows, by its dual.
         normals = constraints.normals
         rows = jax.scipy.linalg.solve_triangular(factor, (normals / scaling[None]).T, lower=True).T

@@ -24,8 +24,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from switchfit.arrays import Traced
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import Array
 from switchfit.optimize.traced_constraints import TracedConstraints, find_active, move_traced
 from switchfit.optimize.traced_qp import compute_scaling, find_traced_direction, hold_coordinates, measure_kkt_residual
 from switchfit.optimize.traced_state import Outcome, TracedPoint, TracedProblem, TracedSample, TracedState
@@ -38,18 +38,18 @@ CRAWLING = (12, 1)
 to `minimize`. Fits that settle refuse a dozen at most; others would go on by hundreds, to no end."""
 
 
-def minimize_traced(task: TracedProblem, start: Array) -> Outcome:
+def minimize_traced(task: TracedProblem, start: Traced) -> Outcome:
     """Minimize J subject to linear constraints from a feasible start (d,), inside a JAX program."""
 
     # One J a turn, then one step where the point was accepted: fits that run in lockstep never wait for a line search.
     def turn(state: TracedState) -> TracedState:
-        after = take_turn(state, task)
+        after = _take_turn(state, task)
         return lax.cond(after.undirected & ~after.done, partial(_find_step, task=task), lambda state: state, after)
 
-    return build_outcome(lax.while_loop(lambda state: ~state.done, turn, TracedState.at(start)), task.constraints)
+    return _build_outcome(lax.while_loop(lambda state: ~state.done, turn, TracedState.at(start)), task.constraints)
 
 
-def take_turn(state: TracedState, task: TracedProblem) -> TracedState:
+def _take_turn(state: TracedState, task: TracedProblem) -> TracedState:
     """Evaluate J once, at the point that is to be judged, and judge it."""
     point = state.point
     trial = _evaluate(state, task)
@@ -92,7 +92,7 @@ def _evaluate(state: TracedState, task: TracedProblem) -> TracedPoint:
     return trial._replace(optimality=measure_kkt_residual(constraints, theta, state.scale, trial.gradient))
 
 
-def _accept(state: TracedState, trial: TracedPoint, tolerance: Array | float) -> TracedState:
+def _accept(state: TracedState, trial: TracedPoint, tolerance: Traced | float) -> TracedState:
     """Return the state at a trial that decreases J; the next step is still to be found."""
     first = jnp.isinf(state.point.cost)
     return state._replace(
@@ -149,7 +149,7 @@ def _find_step(state: TracedState, task: TracedProblem) -> TracedState:
     return state._replace(step=step, slope=slope, undirected=jnp.zeros((), bool), stationary=stationary, done=done)
 
 
-def build_outcome(state: TracedState, constraints: TracedConstraints) -> Outcome:
+def _build_outcome(state: TracedState, constraints: TracedConstraints) -> Outcome:
     """Return what was found where a fit is done."""
     point = state.point
     interior = ~jnp.any(find_active(constraints, point.theta, state.scale))

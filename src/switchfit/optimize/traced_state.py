@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from switchfit.arrays import ArrayModule, Traced
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import Array
 from switchfit.optimize.traced_constraints import TracedBreakpoints, TracedConstraints
 
-TracedEvaluate = Callable[[Array, Array], tuple[Array, Array, Array]]
+TracedEvaluate = Callable[[Traced, Traced], tuple[Traced, Traced, Traced]]
 """``evaluate(theta, side)`` returns cost, gradient (d,) and Hessian (d, d); `side` is +1.0 or -1.0: the right or left
 derivatives by coordinates on a breakpoint."""
 
@@ -35,19 +35,19 @@ class Outcome(NamedTuple):
         Coordinates at a kink that holds them.
     """
 
-    theta: Array
-    cost: Array
-    gradient: Array
-    hessian: Array
-    optimality: Array
-    iterations: Array
-    evaluations: Array
-    settled: Array
-    left: Array
-    held: Array
+    theta: Traced
+    cost: Traced
+    gradient: Traced
+    hessian: Traced
+    optimality: Traced
+    iterations: Traced
+    evaluations: Traced
+    settled: Traced
+    left: Traced
+    held: Traced
 
     @classmethod
-    def at_starts(cls, starts: Any, xp: Any = jnp) -> Outcome:
+    def at_starts(cls, starts: Traced, xp: ArrayModule = jnp) -> Outcome:
         """Return the outcomes, in arrays of `xp`, of fits that are all left to `minimize` at their starts (R, d)."""
         count, d = starts.shape
         nothing, none, no = xp.full(count, xp.nan), xp.zeros(count, int), xp.zeros(count, bool)
@@ -59,9 +59,9 @@ class Outcome(NamedTuple):
 class TracedSample(NamedTuple):
     """J and its derivatives on one side of the breakpoints: (), (d,), (d, d)."""
 
-    cost: Array
-    gradient: Array
-    hessian: Array
+    cost: Traced
+    gradient: Traced
+    hessian: Traced
 
 
 class TracedProblem(NamedTuple):
@@ -70,8 +70,8 @@ class TracedProblem(NamedTuple):
     evaluate: TracedEvaluate
     constraints: TracedConstraints
     breakpoints: TracedBreakpoints
-    tolerance: Array | float
-    max_iterations: Array | int
+    tolerance: Traced | float
+    max_iterations: Traced | int
 
 
 class TracedPoint(NamedTuple):
@@ -89,20 +89,20 @@ class TracedPoint(NamedTuple):
     optimality : ()
     """
 
-    theta: Array
+    theta: Traced
     right: TracedSample
     left: TracedSample
-    kink: Array
-    crossed: Array = 0
-    optimality: Array = jnp.inf
+    kink: Traced
+    crossed: Traced = 0
+    optimality: Traced = jnp.inf
 
     @property
-    def cost(self) -> Array:
+    def cost(self) -> Traced:
         """J, which is the same on both sides; infinite where J or a derivative is not finite."""
         return self.right.cost
 
     @property
-    def sides(self) -> Array:
+    def sides(self) -> Traced:
         """The side to which each coordinate may move, +1 or -1, and 0 where a kink holds it: (d,).
 
         Chosen as `switchfit.optimize.first_order.steepest_descent` does where no constraint is active.
@@ -110,13 +110,13 @@ class TracedPoint(NamedTuple):
         return jnp.where(self.kink, algebra.choose_sides(self.left.gradient, self.right.gradient, jnp), 1)
 
     @property
-    def gradient(self) -> Array:
+    def gradient(self) -> Traced:
         """The derivative on the side to which each coordinate descends, 0 where a kink holds it: (d,)."""
         sides = self.sides
         return jnp.where(sides == 0, 0.0, jnp.where(sides > 0, self.right.gradient, self.left.gradient))
 
     @property
-    def slopes(self) -> Array:
+    def slopes(self) -> Traced:
         """The larger one-sided derivative of each coordinate, in size: (d,)."""
         return jnp.maximum(jnp.abs(self.right.gradient), jnp.abs(self.left.gradient))
 
@@ -129,26 +129,26 @@ class TracedState(NamedTuple):
 
     point: TracedPoint
     right_there: TracedSample  # what was found on the right of the point to be judged
-    step: Array
-    scale: Array  # largest |theta_i| seen
-    iterations: Array = 0
-    evaluations: Array = 0
-    slope: Array = 0.0
-    length: Array = 1.0  # fraction of the step that is to be judged next
-    trials: Array = 0  # of this step, so far
-    refused: Array = 0  # of all steps
-    inside: Array = False  # whether the step is one inside the present smooth piece
-    undirected: Array = False  # whether a step has to be found
-    halfway: Array = False  # whether the point to be judged has been evaluated on its right
-    below: Array = 0  # iterations since the optimality fell below the tolerance
-    cost_scale: Array = 0.0  # largest |J| seen
-    gradient_scale: Array = 0.0  # largest one-sided derivative seen
-    lowest: Array = jnp.inf
-    done: Array = False
-    stationary: Array = False  # the optimality is below the tolerance and the next step negligible
+    step: Traced
+    scale: Traced  # largest |theta_i| seen
+    iterations: Traced = 0
+    evaluations: Traced = 0
+    slope: Traced = 0.0
+    length: Traced = 1.0  # fraction of the step that is to be judged next
+    trials: Traced = 0  # of this step, so far
+    refused: Traced = 0  # of all steps
+    inside: Traced = False  # whether the step is one inside the present smooth piece
+    undirected: Traced = False  # whether a step has to be found
+    halfway: Traced = False  # whether the point to be judged has been evaluated on its right
+    below: Traced = 0  # iterations since the optimality fell below the tolerance
+    cost_scale: Traced = 0.0  # largest |J| seen
+    gradient_scale: Traced = 0.0  # largest one-sided derivative seen
+    lowest: Traced = jnp.inf
+    done: Traced = False
+    stationary: Traced = False  # the optimality is below the tolerance and the next step negligible
 
     @classmethod
-    def at(cls, start: Array) -> TracedState:
+    def at(cls, start: Traced) -> TracedState:
         """Return the state before the first evaluation."""
         d = start.shape[0]
         unknown = TracedSample(jnp.inf, jnp.full(d, jnp.nan), jnp.full((d, d), jnp.nan))

@@ -69,13 +69,13 @@ def get_usable_folder() -> Path | None:
         found = path.stat()
     except OSError:
         return None
-    if reason := can_others_write(found):
+    if reason := _find_other_writers(found):
         _warn_once(path, reason)
         return None
     return path if os.access(path, os.W_OK) else None
 
 
-def can_others_write(found: os.stat_result) -> str:
+def _find_other_writers(found: os.stat_result) -> str:
     """Return why others may have written a file or a folder; "" if they cannot, or the system does not tell."""
     if not hasattr(os, "geteuid"):
         return ""
@@ -110,7 +110,7 @@ def read_code(path: Path) -> bytes | None:
     except OSError:
         return None
     check, code = content[:32], content[32:]
-    return code if hashlib.sha256(code).digest() == check and not can_others_write(found) else None
+    return code if hashlib.sha256(code).digest() == check and not _find_other_writers(found) else None
 
 
 def write_code(path: Path, code: bytes) -> None:

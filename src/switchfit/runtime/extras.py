@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from types import ModuleType
 
 from switchfit.runtime.errors import InputError
 
@@ -12,7 +12,7 @@ class MissingExtraError(InputError, ImportError):
     """A library that comes with one of switchfit's extras is not installed; the message has the command."""
 
 
-def import_library(name: str, what: str, install: str, otherwise: str = "") -> Any:
+def import_library(name: str, what: str, install: str, otherwise: str = "") -> ModuleType:
     """Return a library that is imported where it is needed.
 
     Parameters

@@ -13,6 +13,7 @@ from functools import singledispatch
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.runtime.extras import import_library
 from switchfit.runtime.presentation import call_registered
@@ -25,7 +26,7 @@ class Column(NamedTuple):
     """Name, values (one a row) and unit of a column, empty where there is none, or where rows differ in it."""
 
     name: str
-    values: Any
+    values: NDArray[Any]
     unit: str = ""
 
 
@@ -39,7 +40,7 @@ class Frame:
 
 
 @singledispatch
-def describe_frame(result: Any, **settings: Any) -> Frame:
+def describe_frame(result: object, **settings: object) -> Frame:
     """Return the numbers of a result with their names and units.
 
     Parameters

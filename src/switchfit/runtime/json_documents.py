@@ -61,7 +61,7 @@ def parse_document(text: bytes, path: Path, what: str, form: str, version: int) 
     return content
 
 
-def _lay_out(value: Any, indent: str = "") -> str:
+def _lay_out(value: object, indent: str = "") -> str:
     """Return JSON with one entry of an object or one row of an array on a line."""
     deeper = indent + "  "
     if isinstance(value, dict) and value:

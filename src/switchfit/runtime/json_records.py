@@ -18,7 +18,7 @@ from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,11 +27,17 @@ if TYPE_CHECKING:
 NONFINITE_NUMBERS = ("NaN", "Infinity", "-Infinity")
 """Strings that stand for numbers."""
 
+Json: TypeAlias = Any
+"""What `json.loads` returns: its type is what `from_json` finds out."""
+
+Annotation: TypeAlias = Any
+"""The type of a field: a class, a union, ``tuple[...]``, ``Literal[...]``; typing has no type for all of them."""
+
 
 # --- to JSON ----------------------------------------------------------------------------------------------------------
 
 
-def to_json(record: Any, kind: type) -> Any:
+def to_json(record: object, kind: type) -> Json:
     """Return a dataclass by the fields of `kind` in terms of dict, list, str, int, finite float, bool and None.
 
     Parameters
@@ -47,7 +53,7 @@ def to_json(record: Any, kind: type) -> Any:
     return json.loads(encode(named, inf_nan_mode="strings", fallback=_encode_array))
 
 
-def _encode_array(value: Any) -> Any:
+def _encode_array(value: object) -> Json:
     """Return an array as a list, or with its dtype and shape; TypeError for anything else."""
     import numpy as np
 
@@ -61,7 +67,7 @@ def _encode_array(value: Any) -> Any:
 # --- from JSON --------------------------------------------------------------------------------------------------------
 
 
-def from_json(kind: Any, content: Any, where: str) -> Any:
+def from_json(kind: Annotation, content: Json, where: str) -> Any:
     """Return a dataclass from JSON.
 
     Parameters
@@ -82,7 +88,7 @@ def from_json(kind: Any, content: Any, where: str) -> Any:
         raise ValueError(f"{where} is not what was written") from error
 
 
-def _read(kind: Any, content: Any) -> Any:
+def _read(kind: Annotation, content: Json) -> Any:
     """Return what a type stands for: a dataclass, or one of the types of its fields; an error of any kind if wrong."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (UnionType, Union):
@@ -110,7 +116,7 @@ def _read(kind: Any, content: Any) -> Any:
     return content
 
 
-def _read_either(kinds: tuple[Any, ...], content: Any) -> Any:
+def _read_either(kinds: tuple[Annotation, ...], content: Json) -> Any:
     """Return the content as the first of several types that it can be."""
     if content is None and NoneType in kinds:
         return None
@@ -121,13 +127,13 @@ def _read_either(kinds: tuple[Any, ...], content: Any) -> Any:
 
 
 @cache
-def _get_hints(kind: Any) -> dict[str, Any]:
+def _get_hints(kind: Annotation) -> dict[str, Annotation]:
     """Return the types of the fields of a dataclass by their names."""
     hints = get_type_hints(kind)
     return {f.name: hints[f.name] for f in fields(kind)}
 
 
-def find_dtype(kind: Any) -> np.dtype[Any] | None:
+def find_dtype(kind: Annotation) -> np.dtype[Any] | None:
     """Return the dtype of an annotation that stands for an array; None for any other.
 
     Parameters
@@ -144,7 +150,7 @@ def find_dtype(kind: Any) -> np.dtype[Any] | None:
     return np.dtype((get_args(last) or (last,))[0])
 
 
-def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
+def _read_array(declared: np.dtype[Any], value: Json) -> NDArray[Any]:
     """Return an array of the declared type from a list of numbers, or from its dtype, shape and values."""
     import numpy as np
 

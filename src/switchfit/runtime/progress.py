@@ -11,7 +11,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from rich.text import Text
 
 DELAY = 1.0
 """Seconds after which the line of progress is shown; shorter calls show none."""
@@ -25,7 +28,7 @@ Progress = Callable[[int, int], object]
 _current: ContextVar[Line | None] = ContextVar("line of progress", default=None)
 
 
-def is_terminal(stream: Any) -> bool:
+def _is_terminal(stream: TextIO | None) -> bool:
     """Return whether a stream is a terminal; False if it is closed, or None as in a program without a console."""
     try:
         return stream is not None and bool(stream.isatty())
@@ -33,7 +36,7 @@ def is_terminal(stream: Any) -> bool:
         return False
 
 
-def is_notebook() -> bool:
+def _is_notebook() -> bool:
     """Return whether the code runs in a notebook: in IPython with a kernel."""
     ipython = sys.modules.get("IPython")  # a notebook has imported it
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
@@ -60,7 +63,7 @@ class Line:
         """Draw the line, after `DELAY` seconds, until the call ends."""
         if self.ended.wait(DELAY):
             return
-        with _show_below(self) if is_notebook() else _show_on_terminal(self) as redraw:
+        with _show_below(self) if _is_notebook() else _show_on_terminal(self) as redraw:
             while not self.ended.wait(REDRAW):
                 redraw()
 
@@ -74,7 +77,7 @@ class Line:
             )
         return f"{', '.join(filter(None, parts))}   {seconds:.0f} s"
 
-    def __rich__(self) -> Any:
+    def __rich__(self) -> Text:
         from rich.text import Text
 
         return Text(self.describe(), no_wrap=True, overflow="ellipsis")
@@ -85,7 +88,7 @@ def _show_on_terminal(line: Line) -> Iterator[Callable[[], object]]:
     from rich.console import Console
     from rich.live import Live
 
-    console, redirect = Console(stderr=True), is_terminal(sys.stdout)
+    console, redirect = Console(stderr=True), _is_terminal(sys.stdout)
     settings: dict[str, Any] = {"redirect_stdout": redirect, "redirect_stderr": redirect, "auto_refresh": False}
     with Live(line, console=console, transient=True, **settings) as live:
         yield live.refresh
@@ -96,7 +99,7 @@ def _show_below(line: Line) -> Iterator[Callable[[], object]]:
     """Show a line below the cell of a notebook."""
     shown = importlib.import_module("IPython.display")  # is there in a notebook alone
 
-    def describe() -> Any:
+    def describe() -> object:
         bar = f' value="{line.done}" max="{line.total}"' if line.total else ""
         return shown.HTML(f"<progress{bar}></progress> {escape(line.describe())}")
 
@@ -113,7 +116,7 @@ def show_line(text: str) -> Iterator[Line]:
     """
     line = Line(text)
     is_first = _current.get() is None and threading.current_thread() is threading.main_thread()
-    line.is_shown = is_first and (is_terminal(sys.stderr) or is_notebook())
+    line.is_shown = is_first and (_is_terminal(sys.stderr) or _is_notebook())
     token = _current.set(line)
     # ipykernel finds the cell of an output by a context variable.
     thread = threading.Thread(target=copy_context().run, args=(line.draw,), daemon=True)

@@ -5,11 +5,13 @@ To import it takes as long as to fit, and much of what people do with a model do
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> Callable[..., Any]:
     import scipy.special
 
-    found = globals()[name] = getattr(scipy.special, name)
+    found: Callable[..., Any] = getattr(scipy.special, name)
+    globals()[name] = found  # the next look-up does not come here
     return found

@@ -11,13 +11,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from operator import sub
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, Traced
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, read_parameters
 from switchfit.discretization.signals import Piece
@@ -285,7 +284,7 @@ class Integrator:
 
         return slope
 
-    def _call_model(self, function: Callable[..., jax.Array], *given: Any, **settings: Any) -> FloatArray:
+    def _call_model(self, function: Callable[..., jax.Array], *given: Traced, **settings: object) -> FloatArray:
         """Return the value of a function of the model, at the parameters."""
         with use_float64(), use_compilation_cache():
             return np.asarray(call_model(self._arguments, *given, self._p, function=function, **settings))

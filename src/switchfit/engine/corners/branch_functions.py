@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any
 
 import jax
 import numpy as np
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, Traced
 from switchfit.engine.native.tracing.trace import trace_scalars
 from switchfit.engine.native.tracing.unsupported import Unsupported
 from switchfit.problem.functions import Function, use_float64
@@ -33,7 +32,7 @@ def trace_for_numpy(function: Function) -> Callable[..., FloatArray]:
         else:
             return lambda t, moving, p: template.evaluate([t], *(a.T for a in moving), *map(np.ravel, p))[0]
 
-    def evaluate(t: Any, moving: Sequence[FloatArray], p: Sequence[FloatArray]) -> FloatArray:
+    def evaluate(t: Traced, moving: Sequence[FloatArray], p: Sequence[FloatArray]) -> FloatArray:
         """Evaluate by JAX, point by point: it would compile a program for each number of points."""
         if np.ndim(t):
             return np.array([evaluate(at, inputs, p) for at, *inputs in zip(t, *moving, strict=True)])

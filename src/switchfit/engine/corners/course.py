@@ -8,12 +8,11 @@ slides.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import BoolArray, FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import read_parameters
 from switchfit.engine.corners.branch_functions import trace_for_numpy
@@ -120,7 +119,9 @@ class Course:
         """The corners of the mode that the trajectory is in."""
         return self.branches.corners[self._mode]
 
-    def evaluate(self, function: Function, t: float | FloatArray, x: FloatArray, inside: Any) -> FloatArray:
+    def evaluate(
+        self, function: Function, t: float | FloatArray, x: FloatArray, inside: float | FloatArray
+    ) -> FloatArray:
         """Evaluate a function of the mode at times () or (L,); an input is that of the cells that `inside`, () or (L,),
         is in.
         """
@@ -223,7 +224,7 @@ class Course:
         with np.errstate(all="ignore"):
             return bool(np.isfinite(self.evaluate(self.corners.beyond(sides, k), t, x, inside)).all())
 
-    def list_ends(self, mode: int, sides: Sides) -> tuple[list[int], NDArray[np.bool_]]:
+    def list_ends(self, mode: int, sides: Sides) -> tuple[list[int], BoolArray]:
         """Return the corners of the ends of a branch, and which of them it slides along."""
         of_end = [k for k, _ in self.branches.corners[mode].list_ends(sides)]
         return of_end, np.array([sides[k] == 0 for k in of_end])
@@ -291,7 +292,7 @@ class Course:
             found = self.evaluate(function, t0 + h * s, state_at(s), inside)
             return np.where(np.isfinite(found), found, np.inf)
 
-        def narrow(low: float, high: float, limits: FloatArray) -> tuple[float, float, NDArray[np.bool_]]:
+        def narrow(low: float, high: float, limits: FloatArray) -> tuple[float, float, BoolArray]:
             """Return the first part of a grid at whose end a function is below its limit, and which of them are."""
             s = np.linspace(low, high, PARTS_OF_STEP + 1)[1:]
             passed = values_at(s) < limits
@@ -369,7 +370,7 @@ class Course:
         return 0
 
 
-def find_dips(values: FloatArray) -> NDArray[np.bool_]:
+def find_dips(values: FloatArray) -> BoolArray:
     """Return in which steps, (L, E), functions with these values (L + 1, E) may have been negative, but at both ends.
 
     They fall before the step and rise after it, and change by much of their size in it or beside it.

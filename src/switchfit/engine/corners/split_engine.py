@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive.integrator import SolveSettings
@@ -88,15 +88,15 @@ class _Split(NamedTuple):
     corners: list[Corners]
     structure: Structure
     engine: SmoothEngine
-    own: NDArray[np.intp]
-    crossings: NDArray[np.intp]
-    guarded: NDArray[np.intp]
-    idle: NDArray[np.intp]
-    own_constraints: NDArray[np.intp]
-    guards: NDArray[np.intp]
-    idle_guards: NDArray[np.intp]
+    own: IntArray
+    crossings: IntArray
+    guarded: IntArray
+    idle: IntArray
+    own_constraints: IntArray
+    guards: IntArray
+    idle_guards: IntArray
 
-    def hold(self, touched: NDArray[np.bool_]) -> _Split:
+    def hold(self, touched: BoolArray) -> _Split:
         """Return the same with some of the guarded crossings among the idle ones, at the times where they are."""
         return self._replace(
             guarded=self.guarded[~touched],
@@ -215,7 +215,7 @@ class SplitEngine:
         modes = np.array(self._structure.mode_of_segment)[np.searchsorted(tau, inner.times, "right")]
         return inner._replace(modes=modes, costates=psi)
 
-    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
+    def slopes(self, times: FloatArray, cells: IntArray, states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
         return self._plain.slopes(times, cells, states, p)
 

@@ -8,12 +8,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
 from switchfit.discretization import path_costs, propagation, sampled_states
 from switchfit.discretization.model import Model, apply_weights
 from switchfit.discretization.signals import Piece
-
-Array = jax.Array
 
 
 def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Array, Array, Array]:

@@ -10,9 +10,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, IntArray, Traced
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh, MeshRows, build_rows
 from switchfit.discretization.signals import Piece
@@ -74,7 +73,7 @@ class JaxEngine:
         J, g, H = self._run(derivatives, tau, p, float(side), method=method, matrix=matrix)
         return Evaluation(float(J), np.array(g), np.array(H))  # copies: arrays of JAX are read-only
 
-    def _run(self, program: Callable[..., Any], *given: Any, **settings: Any) -> Any:
+    def _run(self, program: Callable[..., Any], *given: Traced, **settings: object) -> Any:
         """Return what a program yields for the experiment; only once it looks for it among the compiled ones."""
         key = program, *settings.values()
         with use_float64(), nullcontext() if key in self._compiled else use_compilation_cache():
@@ -100,7 +99,7 @@ class JaxEngine:
         states, costates = (np.asarray(values)[rows] for values in found)
         return Costates.of_rows(self._structure, layout.first_row, layout.start[rows], states, costates)
 
-    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
+    def slopes(self, times: FloatArray, cells: IntArray, states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
         count, padded = len(times), pad_length(len(times))  # for few different programs
         pieces = Piece(self._arguments.nodes[cells], self._arguments.signals[cells])

@@ -14,13 +14,14 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
 from switchfit.discretization import path_costs, propagation, sampled_states
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import Model
 from switchfit.discretization.signals import Piece
 from switchfit.engine.evaluation import Matrix
-from switchfit.engine.jax.gauss_newton import Array, differentiate_residuals
+from switchfit.engine.jax.gauss_newton import differentiate_residuals
 from switchfit.problem.structure import Structure
 
 Method = Literal["forward", "discrete-adjoint"]
@@ -82,13 +83,13 @@ def _evaluate(model: Model, theta: Array, side: Array, constrained: bool = False
     return path_costs.compute_path_cost(model, path, p), c
 
 
-def _differentiate(method: Method, function: Callable[[Array], tuple[Array, Any]], theta: Array) -> Any:
+def _differentiate(method: Method, function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
     """Return the derivative (D,) of the first result, and the second; JAX cannot go back through an endless loop."""
     found = _try_backward(function, theta) if method == "discrete-adjoint" else None
     return found or jax.jacfwd(function, has_aux=True)(theta)
 
 
-def _try_backward(function: Callable[[Array], tuple[Array, Any]], at: Array) -> Any:
+def _try_backward(function: Callable[[Array], tuple[Array, Any]], at: Array) -> tuple[Array, Any] | None:
     """Return the derivative of the first result, and the second; None if there is a loop of unknown length."""
     try:
         return jax.grad(function, has_aux=True)(at)
@@ -180,7 +181,11 @@ def simulate_rows(
 
 @partial(jax.jit, static_argnames=("structure", "function", "which"))
 def call_model(
-    arguments: Arguments, *given: Any, structure: Structure, function: Callable[..., Array], which: tuple[int, ...] = ()
+    arguments: Arguments,
+    *given: object,
+    structure: Structure,
+    function: Callable[..., Array],
+    which: tuple[int, ...] = (),
 ) -> Array:
     """Return ``function(model, *which, *given)``, compiled."""
     return function(Model(structure, arguments), *which, *given)

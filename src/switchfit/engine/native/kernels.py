@@ -41,7 +41,8 @@ import numpy as np
 from switchfit.discretization import row_errors, rows, tableaus
 from switchfit.discretization.model import AT_TRANSITIONS
 from switchfit.discretization.rows import Stages, Tangent, combine, times_vector
-from switchfit.discretization.tableaus import EXPLICIT, STIFF, Tableau
+from switchfit.discretization.runge_kutta import Tableau
+from switchfit.discretization.tableaus import EXPLICIT, STIFF
 from switchfit.engine.native.elimination import Elimination, Routine, eliminate
 from switchfit.engine.native.layout import MOST_KEPT_VALUES, has_jumps
 from switchfit.engine.native.llvm.module import Module
