@@ -70,6 +70,8 @@ def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
 def put_on_mesh(common: Arguments, experiment: Experiment, mesh: Mesh) -> Arguments:
     """Return the arguments of an experiment on a mesh, from those that suit any mesh."""
     # Of each sample the index of the cell that ends at it; -1 for t0.
+    # A sample belongs to the end of a cell: it sees the state before a jump at its time. A transition at its time is
+    # before or behind it by the side on which J is asked for (`build_rows`), whose one-sided derivatives differ.
     cells = (np.searchsorted(mesh.times, item.seen_times) - 1 for item in experiment.measurements)
     samples = tuple(
         padded._replace(cell=_pad_with_last(cell, len(padded.time), 0))  # type: ignore[arg-type]  # made jax arrays
@@ -105,6 +107,7 @@ def _drop_off_diagonal_zeros(W: FloatArray) -> FloatArray:
 
 def _pad_samples(item: Measurements, length: int, t0: float) -> Samples:
     """Return samples of one Measurements, padded with missing ones to a length, without their cells."""
+    # Padding repeats the last time with the weight 0, so that it is in the last cell, and its terms in J are exactly 0.
     rows = ((0, length - len(item.times)), (0, 0))
     times, values = _pad_with_last(item.seen_times, length, t0), np.pad(np.nan_to_num(item.values), rows)
     return Samples(np.zeros(0, int), times, values, np.pad(item.weights, rows))  # type: ignore[arg-type]  # made jax arrays
@@ -120,6 +123,7 @@ def _pad_with_last(array: NDArray[Any], length: int, first: float) -> NDArray[An
 def split_by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:
     """Return one signal as a cubic in each cell of a mesh that has its knots as nodes: (G, 4, q)."""
     starts, ends = mesh.nodes[:-1], mesh.nodes[1:]
+    # The middle of a cell is in one piece of the signal for certain: at its ends, which are knots, a held input jumps.
     k = signal.interval(0.5 * (starts + ends))
     s = starts - signal.knots[k]
     shifted = signal.coefficients.T.take(k, axis=2)  # cells last: loops over them are the fast ones

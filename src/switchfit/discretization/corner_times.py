@@ -48,12 +48,15 @@ def find_corner_times(structure: Structure, experiment: Experiment, fixed: Seque
             evaluate = partial(_evaluate, corners, experiment, structure, [np.asarray(named[k], float) for k in known])
             nodes = Mesh.of(experiment).times
             bends, jumps = _find_crossings(evaluate, nodes)
+            # At a jump f has two values: with nodes just before and behind it, a row of the length 2e-10 of the horizon
+            # is all that has stages on both sides.
             apart = APART * (nodes[-1] - nodes[0])
             found += [bends, jumps - apart, jumps + apart]
     if not found:
         return np.zeros(0)
     times = np.unique(np.concatenate(found))
     times = times[np.diff(times, prepend=-np.inf) > 0.5 * apart]
+    # Those that lie on nodes that are there already add nothing but a row as short as rounding.
     return times[np.searchsorted(nodes, times - 0.5 * apart) == np.searchsorted(nodes, times + 0.5 * apart)]
 
 
@@ -65,6 +68,7 @@ def _evaluate(
     times: FloatArray,
 ) -> list[FloatArray]:
     """Return g of the corners of a function at times (L,): (L, k) of bends, (L, l) of jumps."""
+    # Of all times at once; the input may be an array, flat in the signals.
     shape = structure.input_shape
     u = [] if shape is None else [experiment.signals[-1](times).reshape(-1, *shape)]
     # Padded by repeating them, so that the grid and the bisection, and logs of similar length, share a program.
@@ -76,6 +80,7 @@ def _evaluate(
 
 def _find_crossings(evaluate: Callable[[FloatArray], list[FloatArray]], nodes: FloatArray) -> list[FloatArray]:
     """Return the times at which bends and at which jumps change their signs between nodes."""
+    # Up to an ulp before the end of a cell: at its end itself a held input has the value of the next cell.
     grid, found = np.linspace(nodes[:-1], np.nextafter(nodes[1:], nodes[:-1]), GRID_PARTS + 1, axis=1), []
     for kind, g in enumerate(evaluate(grid.ravel())):
         level = ZERO_LEVEL * np.fmax.reduce(np.abs(g), axis=0, initial=0.0)

@@ -62,6 +62,8 @@ class Mesh:
         """Return the mesh whose nodes are `times`, in any order and with repetitions."""
         nodes = np.unique(times)
         cells = len(nodes) - 1
+        # Padded cells have the length 0 and lie behind tf: rows in them change nothing, but are computed. `build_rows`
+        # keeps transitions out of them.
         padding = np.full(pad_length(cells) - cells, nodes[-1])
         return cls(np.concatenate([nodes, padding]), cells, stiffness)
 
@@ -74,6 +76,7 @@ class Mesh:
         ends = np.array([experiment.t0, experiment.end])
         samples = (item.seen_times for item in experiment.measurements)
         times = np.concatenate([ends, *samples, *(signal.knots for signal in experiment.signals), *more])
+        # Knots may lie outside of the horizon, for signals are defined beyond it.
         mesh = cls.from_times(times[(times >= ends[0]) & (times <= ends[1])])
         return replace(mesh, has_rest=experiment.has_free_tf)
 
@@ -120,6 +123,8 @@ class Mesh:
         `has_limits` says whether stability limits explicit ones.
         """
         nodes, (times, counts) = self.times, _count_steps(solutions)
+        # Steps of the solver in each cell: a cell between two samples has at least one row, however smooth the
+        # trajectory.
         needed = np.diff(np.interp(nodes, times, counts))
         if self.has_rest or (needed.max() > MANY_STEPS and has_limits()):
             needed *= _compare_densities(nodes, times, counts)
@@ -215,6 +220,7 @@ def build_rows(nodes: Traced, tau: Traced, side: Traced, xp: ArrayModule = jnp) 
     right = (side[:, None] if several else side) > 0
     # How many nodes each of tau is past.
     passed = xp.where(right, nodes[None] <= tau[:, None], nodes[None] < tau[:, None]).sum(1)
+    # See `Structure.fix_sides`: times at nodes that are known jumps have a side of their own.
     if several and N:  # of two equal times with different sides, the later one must not begin in an earlier cell
         passed = xp.maximum.accumulate(passed)
     real_cells = (nodes[1:] > nodes[:-1]).sum()  # without padding: tau = tf stays before the samples and costs at tf
@@ -227,6 +233,8 @@ def build_rows(nodes: Traced, tau: Traced, side: Traced, xp: ArrayModule = jnp) 
     cell = row - segment
     opens = (row == first_row[segment]) & (segment > 0)
     # A row ends at tau where the next one opens a segment, else at the node.
+    # The node at the end of a row counts only where no transition ends it before: a row that is cut twice begins and
+    # ends at transition times.
     closes = xp.concatenate([opens[1:], xp.zeros(1, bool)])
     begins, finishes = xp.concatenate([nodes[:1], tau]), xp.concatenate([tau, nodes[-1:]])
     start = xp.where(opens, begins[segment], nodes[cell])

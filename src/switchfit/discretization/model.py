@@ -92,12 +92,14 @@ class Model:
         if not function.takes_input:
             return ()
         shape, size = function.structs[2].shape, int(np.prod(self.structure.input_shape or ()))
+        # References come first in the channels of a cell, the input last.
         own = Piece(piece.origin, piece.coefficients[:, piece.coefficients.shape[1] - size :])
         both = own(t) if shape == self.structure.input_shape else jnp.stack([own(t), own.rate(t)])
         return (both.reshape(shape),)
 
     def find_piece(self, t: Array) -> Piece:
         """Return the signals in the cell that ends at a time or holds it."""
+        # The cell that ends at t: guards and costs at a transition are those before it. Which it is has no derivative.
         nodes = jnp.asarray(self.arguments.nodes)
         cell = jnp.clip(jnp.searchsorted(nodes, jax.lax.stop_gradient(t)) - 1, 0, len(nodes) - 2)
         return Piece(nodes[cell], jnp.asarray(self.arguments.signals)[cell])
@@ -131,6 +133,7 @@ class Model:
         def residual(observe: Function | None, channels: slice, t: Array, x: Array, p: Array) -> Array:
             return self.observe(observe, t, x, p) - piece(t)[channels]
 
+        # Each reference has its channels behind those of the references before it.
         ends = accumulate(channels for _, channels in self.structure.references)
         each = zip(self.structure.references, ends, strict=True)
         return [partial(residual, observe, slice(end - channels, end)) for (observe, channels), end in each]
@@ -204,6 +207,7 @@ class Model:
         """Return x(t0), (n,)."""
         if self.structure.initial_state is None:
             unknown = self.structure.unknown_states
+            # The unknown entries are the last unknowns of p, in the order of the states.
             x0 = self.arguments.initial_state
             return x0.at[np.array(unknown)].set(p[-len(unknown) :]) if unknown else x0
         return self.structure.initial_state(self.parameters(p))

@@ -42,6 +42,8 @@ def integrate_running_cost(model: Model, path: Path, p: Array) -> Array:
     def ell(mode: int, piece: Piece, t: Array, x: Array) -> Array:
         return model.density(mode, piece)(t, x, p)
 
+    # Equation (2) of the paper by the quadrature of the method itself: J is then the state of one more equation, and
+    # has the same order as x.
     return (weigh_stages(model, path.layout) * map_stages(model, path, ell, path.stages)).sum()
 
 
@@ -54,6 +56,9 @@ def map_stages(model: Model, path: Path, function: Callable[..., Any], states: A
     def of_mode(mode: int) -> Callable[..., Any]:
         return jax.vmap(partial(function, mode), in_axes=(None, 0, 0))
 
+    # The running cost has no mode: all rows at once. With a free tf the rows behind it are the rest, in which nothing
+    # is to be counted, nor evaluated where it may not be defined; then row by row, for `lax.switch` inside `vmap` would
+    # evaluate both.
     rows = path.pieces, path.times, states
     if not model.structure.has_free_tf:
         return jax.vmap(of_mode(0))(*rows)
@@ -69,6 +74,7 @@ def weigh_stages(model: Model, layout: MeshRows) -> Array:
 def add_point_costs(model: Model, path: Path, p: Array) -> Array:
     """Return the sum of the costs at transitions and at the end: ()."""
     total = jnp.zeros(())
+    # Costs at a transition are of the state before its reset map, as the guards are.
     for i, cost in list_transition_functions(model, "transition_costs"):
         total = total + cost(*path.at_transition(i), p)
     return total + model.terminal(path.after[-1], p)

@@ -43,6 +43,7 @@ class Path(NamedTuple):
 
     def at_transition(self, i: int) -> tuple[Array, Array]:
         """Return tau_i and x(tau_i-), before the reset map, of transition i (from 0): (), (n,)."""
+        # The last row of the segment before: its state is x(tau-), to which guards, costs and reset maps refer.
         last = self.layout.first_row[i + 1] - 1
         return self.layout.end[last], self.after[last]
 
@@ -100,6 +101,7 @@ def propagate(model: Model, tau: Array, p: Array, side: Array, nudges: Array | N
     def advance(x: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, nudge, *row = given
         x = _apply_reset(model, tau, x, p, segment, opens)
+        # Behind the reset map: a costate at the start of a row is that of x(tau+).
         x = x if nudge is None else x + nudge
         after, *found = switch_mode(model, segment, through, *row, x)
         return after, (x, after, *found)

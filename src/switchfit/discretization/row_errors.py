@@ -23,6 +23,7 @@ def estimate_error(h: Traced, k: Sequence[Traced], slope: Traced, f_x: Traced, f
 
     ``(I - h g D_1 f)^-1 g (h f + sum_j e_j k_j)``, of order 4, with f (n,) and D_1 f (n, n) at the start of the row.
     """
+    # The factor (I - h g J)^-1 keeps the estimate bounded along stiff components, for which h f alone would be huge.
     right = STIFF_DAMPING * (h * slope + combine(STIFF_ERROR, k))
     (error,) = factorize(np.array([[STIFF_DAMPING]]), h, [f_x]).solve([right])
     return error
@@ -45,5 +46,6 @@ def measure_jump(first: Traced, middle: Traced, last: Traced, bend: Traced, smoo
     rest = xp.abs(change - smooth)
     # A jump is what neither the smoothness of f nor its derivatives explain: the smaller of bend and rest counts.
     span = xp.maximum(xp.abs(change), xp.abs(middle - first))
+    # Beside the range of the slopes, and beside the slope itself: of a constant slope the range is rounding.
     least = LARGEST_BEND * span + SMALLEST_BEND * xp.abs(first)
     return xp.where(xp.less(least, xp.minimum(bend, rest)), bend, 0.0)

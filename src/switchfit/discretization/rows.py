@@ -89,6 +89,7 @@ class Factors(Protocol):
 
 def couple(a: Traced, h: Traced, f_x: Sequence[Traced]) -> list[list[Traced]]:
     """Return the matrix of the coupled equations, ``I - h a_jl D_1 f_j``, in s by s blocks (n, n)."""
+    # A zero block is the product of 0 and the unit, whose type is that of the nodes of a graph.
     unit = np.eye(f_x[0].shape[0])
     return [
         [(unit if j == m else 0.0 * unit) - (h * a_jm) * f_x[j] for m, a_jm in enumerate(row)]
@@ -109,8 +110,11 @@ def choose_slopes(h: Traced, k: Sequence[Traced], f_X: Sequence[Traced], f_x: Tr
     xp : module
         jax.numpy, or the namespace of a graph.
     """
+    # The row sums bound the largest eigenvalue from above; h times it is how many times of the fastest component the
+    # row lasts.
     fastest = reduce(xp.maximum, list(xp.abs(f_x).sum(axis=1)))
     is_long = xp.abs(h) * fastest > SHORT_ROW
+    # Both branches of a `where` are evaluated, and differentiated: h must not be 0 in the one that is not taken.
     length = xp.where(xp.equal(h, 0.0), 1.0, h)
     return [xp.where(is_long, own / length, slope) for own, slope in zip(k, f_X, strict=True)]
 
@@ -158,6 +162,7 @@ def tangent(
     if factors is None:
         for J, given, row in zip(f_x, forcing, tableau.a, strict=True):
             states.append(follow(x_d, row, K_d))
+            # K_j' = D_1 f X_j' + D_2 f t_j' + D_p f p'.
             K_d.append(times_vector(J, states[-1]) + given)
     else:
         # (I - h a_jl D_1 f_j) K' = D_1 f_j (x' + h' sum_l a_jl K_l) + D_2 f t_j' + D_p f p'.
@@ -207,6 +212,8 @@ def adjoint(
         if factors is None:
             later = combine(a[j + 1 :, j], mu[j + 1 :])
             w[j] = h * (b[j] * psi + later)
+        # mu_j = D_x (w_j . f + h b_j ell): D_1 f' w_j discretizes psi D_1 f of (7), D_1 ell its source term; in_p sums
+        # up (9).
         times[j], mu[j], in_p = pull(j, w[j], h * b[j])
         parameters = parameters + in_p
     return Adjoint(mu, psi + sum(mu[1:], mu[0]), times, parameters)

@@ -46,6 +46,7 @@ def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, A
     # `step_to_late_sample`.
     times = lax.stop_gradient(jax.vmap(lambda s: model.correct_delay(k, s, p).time)(samples))
     ends = lax.stop_gradient(layout.end)
+    # A time outside of the horizon, at a trial delay, is reached from the first or from the last row.
     row = jnp.minimum(jnp.searchsorted(ends, times), ends.shape[0] - 1)
     piece = jax.tree.map(lambda a: a[row], path.pieces)
     return row, layout.segment[row], piece, layout.start[row], path.before[row]

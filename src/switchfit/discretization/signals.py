@@ -34,6 +34,7 @@ def _polynomial(s: Array, c: Array) -> Array:
     without tangents in all programs but those of `switchfit.experiment_design`, where an input is what is looked for.
     """
     value = c[-1]
+    # Horner's scheme.
     for k in reversed(range(c.shape[0] - 1)):
         value = c[k] + s * value
     return value
@@ -41,6 +42,7 @@ def _polynomial(s: Array, c: Array) -> Array:
 
 def _polynomial_jvp(at: tuple[Array, Array], direction: tuple[Any, Any]) -> tuple[Array, Array]:
     (s, c), (s_d, c_d) = at, direction
+    # `SymbolicZero`, not a product with zeros: where neither s nor c has a tangent, nothing is computed at all.
     powers = jnp.arange(1.0, c.shape[0])[:, None]
     slope = _polynomial(s, powers * c[1:]) if c.shape[0] > 1 else jnp.zeros_like(c[0])
     tangent = jnp.zeros_like(c[0]) if isinstance(s_d, SymbolicZero) else slope * s_d

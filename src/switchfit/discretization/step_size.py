@@ -84,7 +84,9 @@ def judge_error(
     factor = xp.minimum(xp.maximum(SAFETY * xp.float_power(norm, exponent), SMALLEST_FACTOR), largest)
     step = at.step * xp.where(norm >= 0.0, factor, SMALLEST_FACTOR)  # comparisons with a NaN norm are false
     # Comparisons with a NaN step size are false: the solve is stuck, instead of trying for ever.
+    # A step of ten units in the last place changes t by its rounding: below it, the solve has failed.
     stuck = ~(accepted | (_shortest_step(at.t, xp) <= step))
+    # The end is taken as it is, not as t + step: the next stretch begins on its bits, and a node is found there.
     t = xp.where(accepted, xp.where(end - at.t <= at.step, end, at.t + at.step), at.t)
     step = xp.where(accepted, xp.maximum(step, _shortest_step(t, xp)), step)
     now = Progress(t, limit_step(t, step, end, xp), ~accepted, stuck)

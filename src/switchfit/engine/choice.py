@@ -63,8 +63,10 @@ def _engine_on(run: Run, base: Structure, arguments: Arguments, mesh: Mesh, stru
     if reason is None:
         by_jax = JaxEngine if structure is base else _PathFallback
         return NativeEngine(structure, arguments, mesh, by_jax(structure, arguments, mesh))
+    # The structure of a path has guards and branches that nobody has written: the reason is looked for in the user's.
     if structure is not base:
         reason = reason_for_jax(base, arguments) or reason
+    # Whoever reads why a fit is slow wants to know of implicit steps too: they multiply the time of JAX.
     reason = "; ".join([reason, *map(str, mesh.stiffness)])
     if asked == "native":
         raise ValueError(REQUIRED.format(reason))
@@ -104,6 +106,7 @@ def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engi
     records = [each.engine for each in engines]
     implicit_modes = tuple(dict.fromkeys(mode for record in records for mode in record.implicit_modes))
     by_jax = [k for k, record in enumerate(records) if record.name == "jax"]
+    # One experiment by JAX is what makes the problem slow: its reason stands for all.
     found = records[by_jax[0] if by_jax else 0]
     reason = f"{found.reason} (in {names[by_jax[0]]})" if 0 < len(by_jax) < len(records) else found.reason
     return replace(found, reason=reason, implicit_modes=implicit_modes)
@@ -111,6 +114,7 @@ def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engi
 
 def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments]) -> bool:
     """Return whether machine code can evaluate all experiments inside a JAX program: none may have late samples."""
+    # Late samples are rows of their own, which the call from XLA does not have.
     if any(sensor.delay is not None for structure in structures for sensor in structure.measurements):
         return False
     return all(reason_for_jax(s, a) is None for s, a in zip(structures, arguments, strict=True))

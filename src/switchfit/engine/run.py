@@ -64,6 +64,7 @@ class Run:
 
     def build_arguments(self, mesh: Mesh) -> Arguments:
         """Return the arrays that its programs take on a mesh; those on the coarse one are kept."""
+        # Adaptive solves ask for those of the coarse mesh, at each theta.
         if mesh is self.coarse:
             return self._coarse_arguments
         return put_on_mesh(self._common, self.experiment, mesh)

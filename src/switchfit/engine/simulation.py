@@ -102,6 +102,7 @@ class Costates(NamedTuple):
         """
         times, *states = rows
         segment = np.searchsorted(first_row, np.arange(len(times)), "right") - 1
+        # row = cell + segment (`build_rows`).
         cells, modes = np.arange(len(times)) - segment, np.array(structure.mode_of_segment)[segment]
         last = int(first_row[-1]) if structure.has_free_tf else len(times)
         return cls(*(values[:last] for values in (times, cells, modes, *states)))
@@ -125,14 +126,17 @@ def finish_simulation(
     for k, (samples, sensor) in enumerate(zip(arguments.samples, structure.measurements, strict=True)):
         if sensor.delay is None:
             row = simulation.row_ending(np.asarray(samples.cell))
+            # Row -1, a sample at t0, sees the state at the start; all others see the end of a row, before a jump there.
             y = np.where((row < 0)[:, None], simulation.y_before[:1], simulation.y_after[row])
         else:
+            # Machine code leaves out the padding behind the last sample: its last outputs stand for it, with weight 0.
             y = np.concatenate([late[k], np.repeat(late[k][-1:], len(samples.time) - len(late[k]), axis=0)])
         seen.append(y[:, first : first + sensor.channels])
         first += sensor.channels
     simulation = replace(simulation, seen=tuple(seen))
     if not structure.has_free_tf:
         return simulation
+    # The last segment is the rest behind a free tf.
     rows = slice(0, simulation.segments[-1].start)
     by_row = ("start", "end", "before", "after", "y_before", "y_after")
     cut: dict[str, Any] = {name: getattr(simulation, name)[rows] for name in by_row}

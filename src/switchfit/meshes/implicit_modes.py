@@ -56,6 +56,7 @@ class ImplicitModes:
 
     def watch(self, k: int) -> Watch:
         """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its work is limited."""
+        # Elsewhere the explicit steps of the mode are not known: nothing is compared there.
         watch = Watch({name: most for name, (at, most) in self._most.items() if at == k}, refused=self._refused)
         self.watches = [*self.watches[:k], watch]
         return watch
@@ -77,6 +78,8 @@ class ImplicitModes:
             Of the explicit solve at the k-th theta.
         k : int
         """
+        # Refused modes stay refused: else two kinds of steps, each of which takes longer than the other said, would
+        # alternate.
         new = {name: ratio for name, ratio in stiff.items() if name not in self.found and name not in self._refused}
         for name, ratio in new.items():
             steps = explicit.modes[name]
@@ -86,6 +89,7 @@ class ImplicitModes:
     def refuse(self, name: str) -> bool:
         """Let a mode take explicit steps after its implicit ones have failed; return whether it took implicit ones."""
         self._refused.add(name)
+        # Also its limit: the next solve of the mode counts explicit steps, which are compared with nothing.
         self._most.pop(name, None)
         return self.found.pop(name, None) is not None
 

@@ -72,11 +72,13 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
     for run in runs:
         with suppress(NotIntegrableError):
             choices.append(ImplicitModes())
+            # A choice for each problem: one with another guess may be stiff in another mode.
             solutions += _solve_at(run, (run.problem.initial_theta,), choices[-1])
             stiffness = choices[-1].found | stiffness  # as it was found first
     if not solutions:
         _solve_at(runs[0], (runs[0].problem.initial_theta,), ImplicitModes())  # it raises
     fewest = min(map(len, solutions))
+    # `PACE` more than ten times: of a handful of steps ten times as many say nothing.
     kept = [steps for steps in solutions if len(steps) <= MOST_TIMES_FEWEST_STEPS * fewest + PACE]
     return runs[0].coarse.refine(kept, tuple(stiffness.values()), lambda: any(each.has_limits() for each in choices))
 
@@ -90,8 +92,10 @@ def refine_if_unstable(run: Run, mesh: Mesh, *thetas: FloatArray) -> Mesh | None
     """
     if run.problem.solver != "auto":
         return None
+    # By explicit steps, as the mesh has them, to where the failure is; what is seen up to there is enough.
     watch, choice = Watch(between=STEPS_BETWEEN_AFTER_FAILURE), ImplicitModes(mesh.stiffness)
     with suppress(NotIntegrableError):
+        # The eigenvalues at the theta of the failure are what is wanted: the watch has them even where the solve fails.
         solve_adaptively(run, thetas[-1], SolveSettings(choice.found, watch))
     if not choice.add(watch.find_unstable(mesh), watch, 0):
         return None
@@ -124,6 +128,8 @@ def _solve_at(run: Run, thetas: Sequence[FloatArray], choice: ImplicitModes, mos
         except (NotIntegrableError, TooManyStepsError) as error:
             failure = error
         refused = failure is None and choice.count_steps(watch, k)
+        # A mode that changes its method changes the steps at the thetas before, too: all of them are solved anew. Each
+        # mode is added once and refused once at most, so that this ends.
         again = choice.add(watch.find_stiff(), watch, k) or refused
         if again or (failure is not None and choice.refuse(watch.current)):
             solutions = []  # again, with other steps in some mode

@@ -49,11 +49,15 @@ class Breakpoints:
         values, starts, steps, sizes = moved.tolist(), theta.tolist(), step.tolist(), size.tolist()
         for i, points in self.of_coordinates:
             x, by = values[i], steps[i]
+            # The nearer of the two neighbours of x.
             above = bisect_left(points, x)
             if above == len(points) or (above > 0 and x - points[above - 1] <= points[above] - x):
                 above -= 1
             mark = points[above]
             reach = max(abs(starts[i]), abs(by), abs(x)) if by != 0.0 else 0.0
+            # theta + (mark - theta) is not always `mark` in floating point: it may miss it by an ulp of the largest
+            # number on the way. Beside the breakpoint the coordinate would be in a piece of the length of an ulp, with
+            # the derivatives of that one.
             if abs(mark - x) <= 8 * EPS * max(reach, sizes[i]):
                 moved[i] = mark
                 found.append(i)
@@ -64,6 +68,7 @@ class Breakpoints:
         largest = 0
         starts, ends = theta.tolist(), (theta + step).tolist()
         for i, points in self.of_coordinates:
+            # Strictly inside: a step from a breakpoint, or to one, does not pass it.
             low, high = (starts[i], ends[i]) if starts[i] <= ends[i] else (ends[i], starts[i])
             largest = max(largest, bisect_left(points, high) - bisect_right(points, low))
         return largest
@@ -72,6 +77,7 @@ class Breakpoints:
         """Return the smooth piece around theta: bounds (d,) tightened to the next breakpoint on either side."""
         low, high = constraints.lower.copy(), constraints.upper.copy()
         for i, points in self.of_coordinates:
+            # On a breakpoint both neighbours bound it: the side is what `search_direction` adds.
             below, above = bisect_left(points, theta[i]), bisect_right(points, theta[i])
             if below > 0:
                 low[i] = max(low[i], points[below - 1])

@@ -78,6 +78,7 @@ def solve_composite(
     # v, within NORMAL_PART of the region; then t in the null space of A, from the slope g + H v of the model at its
     # end.
     step = _find_normal_step(scaled, rows, room, NORMAL_PART * radius)
+    # As many independent constraints as unknowns: the normal step is the whole step, Newton's for c = 0.
     pull, definite, force = np.zeros(len(room.lower)), True, slope + bending.dot(step)
     if rows.null.size:
         # The programme in w, t = Z w: matrix Z'H Z, slope Z'(g + H v), with w = 0 feasible because v is.
@@ -111,6 +112,8 @@ def _find_normal_step(equalities: Equalities, rows: JacobianSVD, room: Room, rad
     """Return the v of `find_normal_step` in units in which the trust region is a cube."""
     shortest, d = rows.solve(equalities.values), equalities.jacobian.shape[1]
     cube = room.narrow(np.full(d, radius))
+    # The usual case near the solution. Rows of A that depend on one another are no obstacle: the decomposition leaves
+    # out what they repeat, and where they contradict each other the shortest least-squares solution is taken.
     if cube.holds(shortest):
         return shortest
     # The minimum of ||c + A v||^2 / 2 in the region: A'A is singular wherever constraints are fewer than unknowns.

@@ -15,6 +15,10 @@ import numpy as np
 from switchfit.arrays import BoolArray, FloatArray
 from switchfit.optimize import algebra
 
+DEPENDENT_NORMALS = 1e-11
+"""Singular value of unit normals below which they depend on one another: entries are 0 and 1 before they are scaled by
+the unknowns' sizes, so that all that is above rounding counts."""
+
 
 class Spectrum(NamedTuple):
     """The lowest end of the spectrum of a Hessian on the free directions.
@@ -60,5 +64,7 @@ def null_space(normals: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the null space of normals (k, d): shape (d, d - r)."""
     if normals.size == 0:
         return np.eye(normals.shape[1])
+    # Rows of length one, so that the limit has no unit. Where modes collapse, rows depend on one another: of tau_1 <=
+    # tau_2 <= tau_3 at one time and bounds on them any two say what the third says.
     _, sizes, right = np.linalg.svd(algebra.unit_rows(normals)[0])
-    return np.asarray(right[np.count_nonzero(sizes > 1e-11) :].T)
+    return np.asarray(right[np.count_nonzero(sizes > DEPENDENT_NORMALS) :].T)

@@ -2,7 +2,7 @@
 
 References
 ----------
-.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 16.7.
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 4.3.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class Dense(SymmetricMatrix):
 
         A positive definite H is kept. Otherwise directions across the constraints expected to be active are made
         stiffer, which leaves Newton's step on their face unspoiled. If H is not positive definite on the face either,
-        eigenvalues are replaced by their absolute values, or inside a trust region shifted. All of this is done in
-        scaled variables.
+        eigenvalues are replaced by their absolute values ([1]_, section 3.4), or inside a trust region shifted ([1]_,
+        section 4.3). All of this is done in scaled variables.
 
         Parameters
         ----------
@@ -92,10 +92,6 @@ class Dense(SymmetricMatrix):
             See `diagonal_scaling`.
         reach : array, shape (d,), optional
             Half-widths of the trust region.
-
-        References
-        ----------
-        .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 16.7.
         """
         # The usual case: a Cholesky factorization of the scaled H less the floor shows that H is definite.
         square = np.maximum(self.diagonal(), floor)
@@ -108,6 +104,7 @@ class Dense(SymmetricMatrix):
                 return self, factor
         make_definite: Change = make_absolute
         if reach is None:
+            # Negative or vanishing diagonal entries, or an H that is definite only in another scaling than Jacobi's.
             scaling = diagonal_scaling(self, floor)
             weight, rows = scaling[:, None] * scaling, normals / scaling
             if positive_definite.has_curvature(self.array / weight):

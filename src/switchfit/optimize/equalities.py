@@ -51,6 +51,8 @@ class JacobianSVD(NamedTuple):
     @classmethod
     def of(cls, jacobian: FloatArray) -> JacobianSVD:
         """Decompose a Jacobian (k, d), k > 0."""
+        # Not the normal equations A A': a guard at each of several transitions that collapse into one is the same row
+        # twice, up to the rounding of its derivatives.
         left, sizes, right = np.linalg.svd(jacobian)
         rank = np.count_nonzero(sizes > DEPENDENT * sizes[0])
         return cls(left[:, :rank], sizes[:rank], right[:rank].T, right[rank:].T)

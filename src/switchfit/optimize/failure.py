@@ -47,6 +47,7 @@ def is_below_rounding(oracle: Oracle, state: State, direction: SearchDirection) 
     of both sides counts.
     """
     smallest, largest = 10 * algebra.COST_NOISE * abs(state.point.cost), 10 * algebra.COST_NOISE * state.cost_scale
+    # Outside of these two bounds no evaluation is needed.
     if not smallest < direction.reduction <= largest:
         return direction.reduction <= smallest
     found, step = [np.inf], direction.step
@@ -108,6 +109,7 @@ def explain_failure(oracle: Oracle, state: State, direction: SearchDirection) ->
     step, noise = direction.step, algebra.COST_NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
     line = _Line(oracle, state, step, noise)
     begin = line.see(0.0)
+    # The slope is rounding itself: there is nothing to explain.
     if not begin.slope < 0.0:
         return LineSearchFailure("rounding", {"noise": noise})
     low, high = _locate_rise(line)
@@ -123,6 +125,8 @@ def explain_failure(oracle: Oracle, state: State, direction: SearchDirection) ->
         change = np.abs((high.gradient - low.gradient) * step)
         bent = np.flatnonzero(change > 0.1 * change.max())[:MOST_NAMED_COORDINATES]
         return LineSearchFailure("kink", {"before": low.slope, "after": high.slope}, _list_places(bent, high))
+    # J falls for a part of the step, but by less than can be seen; else it falls visibly and rises again, as along a
+    # bent valley with walls so steep that no straight step stays in it.
     lost = begin.cost - low.cost <= noise and -0.5 * low.fraction * begin.slope <= noise
     return LineSearchFailure("rounding", {"noise": noise}) if lost else LineSearchFailure("valley", {})
 
@@ -144,6 +148,8 @@ def _locate_rise(line: _Line) -> tuple[_Place, _Place]:
         if there.cost <= low.cost + line.noise:
             break
         high = there
+    # Bisection between a place where J falls and one where it has risen, until the two differ by rounding, or J is
+    # smooth between them: a smooth rise is none that has a place.
     while high.fraction - low.fraction > max(LOCATED * high.fraction, SHORTEST):
         if high.cost < np.inf and not line.jumps(low, high) and not line.bends(low, high):
             break
@@ -189,5 +195,7 @@ def _contradict_slope(line: _Line) -> float | None:
         return None
     spread = np.abs(np.diff(values)) + np.array(errors[1:])
     best = int(np.argmin(spread)) + 1
+    # The length whose difference changes least to the next shorter one: longer ones have the error of the formula,
+    # which falls with the square of the length, shorter ones that of rounding, which grows as 1 / length.
     error = 2 * spread[best - 1] + DISAGREES * max(abs(begin.slope), abs(values[best]))
     return values[best] if min(abs(values[best] - begin.slope), farther[best]) > error else None

@@ -70,11 +70,15 @@ def move(problem: MinimizationProblem, theta: FloatArray, step: FloatArray, scal
         return Trial(moved, slack, True, on_breakpoint)
     lower, upper = constraints.lower, constraints.upper
     reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))
+    # Rounding of theta + step, of the largest of the three numbers; a coordinate that does not move has none of its
+    # own, and is on its bound only within that of its size.
     near = 8 * EPS * np.maximum((step != 0.0) * reach, problem.size)
     moved = np.where(moved - near <= lower, lower, np.where(moved + near >= upper, upper, moved))
     if (constraints.A @ moved - constraints.b > 16 * EPS * (constraints.sizes[0] @ problem.size)).all():
         return Trial.at(problem, moved)
     pinned = (moved == lower) | (moved == upper)
+    # What is on a bound or a breakpoint stays there: rows that miss by rounding are repaired by the other unknowns. Two
+    # transitions that meet at a sample time both end on its bits.
     pinned[on_breakpoint] = True
     return Trial.at(problem, snap_to_rows(problem, _repair(constraints, moved, pinned), pinned))
 
@@ -90,6 +94,7 @@ def snap_to_rows(
     constraints = problem.constraints
     slack = constraints.A @ theta - constraints.b
     close = np.abs(slack) <= reach * (constraints.sizes[0] @ problem.size)
+    # All of them hold exactly already, or none is close.
     if not slack[close].any():
         return theta
     snapped, fixed = theta.copy(), pinned.copy()
@@ -107,6 +112,7 @@ def snap_to_rows(
         if np.array_equal(snapped, before):
             break
     snapped = np.clip(snapped, constraints.lower, constraints.upper)
+    # A chain of times between two bounds that differ by rounding leaves no better point.
     return snapped if constraints.violation(snapped) <= constraints.violation(theta) else theta
 
 
@@ -117,6 +123,7 @@ def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: BoolArray
     meet at a vertex is left: it is of the size of rounding too.
     """
     repaired = theta.copy()
+    # A projection onto one row may leave another by an ulp: a few rounds, of which the best point counts.
     for _ in range(6):
         for normal, bound in zip(constraints.A, constraints.b, strict=True):
             inside = np.where(pinned, 0.0, normal)

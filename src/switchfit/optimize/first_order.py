@@ -8,6 +8,12 @@ separable there, so such a coordinate is held, or released to the side to which 
 it. The multipliers of the quadratic programme say when a held coordinate is to be released because others move.
 
 A side is +1 or -1 for a coordinate that moves, or may move, to the right or left, and 0 for one that is held.
+
+References
+----------
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, section 12.3 (first-order conditions).
+.. [2] R. T. Rockafellar, R. J.-B. Wets, Variational Analysis, Springer 1998, chapters 8 and 10 (subderivatives and
+   subgradients of what is not smooth).
 """
 
 from __future__ import annotations
@@ -29,7 +35,9 @@ MANY_CONCAVE_KINKS = 6
 def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tuple[float, FloatArray]:
     """Return the distance of the gradient from the cone of the active constraints, and the multipliers that attain it.
 
-    min over lam >= 0 and low <= g <= high of ‖g − Nᵀ lam‖₂, where low = high except at coordinates held at a kink.
+    min over lam >= 0 and low <= g <= high of ‖g − Nᵀ lam‖₂, where low = high except at coordinates held at a kink. It
+    is zero where the first-order conditions hold ([1]_, theorem 12.1), with the interval for the subgradients at a
+    kink ([2]_).
 
     Parameters
     ----------
@@ -44,6 +52,7 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
     multipliers : array, shape (k,)
     """
     if normals.shape[0] == 0:
+        # Without constraints each coordinate is by itself; `low is high`, the usual case, needs no clipping.
         nearest = low if low is high else np.clip(0.0, low, high)
         return math.sqrt(nearest.dot(nearest)), np.zeros(0)
     size = float(max(np.max(np.abs(low), initial=0.0), np.max(np.abs(high), initial=0.0)))
@@ -51,6 +60,7 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
         return 0.0, np.zeros(normals.shape[0])
     # The steepest descent v = N' lam - g minimizes g v + v² / 2 subject to N v >= 0. At kinks, where g v is
     # max(low v, high v), it has two parts, v = v₊ - v₋: of both being positive the cost is larger than of one.
+    # Scaled to 1 by the largest derivative: daqp's tolerances are absolute.
     unit, lengths = algebra.unit_rows(normals)
     low, high, slope, rows = low / size, high / size, high / size, unit
     if (low < high).any():
@@ -87,6 +97,7 @@ def steepest_descent(
     multipliers : array, shape (k,)
     sides : array of int, shape (d,)
     """
+    # Off all breakpoints, as at most points.
     if left is right:
         return *kkt_residual(right, right, normals), side
     kink = np.zeros(left.size, dtype=bool) if kink is None else kink
@@ -115,6 +126,9 @@ def _choices(sides: IntArray, concave: BoolArray, normals: FloatArray) -> Iterat
     extreme directions move a group of them, all to one side.
     """
     yield sides
+    # A concave kink: J falls to both sides of it, as where a transition passes a sample that neither mode explains. The
+    # rate J' is not convex then, and a descent may exist for one combination of sides alone: two times in order, one
+    # of which would go right and the other left, are blocked by their order, and descend together to the right.
     coupled = np.flatnonzero(concave & np.any(normals != 0.0, axis=0))
     few = coupled.size <= MANY_CONCAVE_KINKS
     for choice in product((1, -1), repeat=coupled.size) if few else [(1,), (-1,)]:

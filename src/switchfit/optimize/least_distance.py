@@ -56,6 +56,7 @@ def find_least_distance(
     sense = np.zeros(lower.size, dtype=np.int32) if equal is None else np.where(equal, EQUALITY, 0).astype(np.int32)
     identity = np.eye(target.size)
     for tolerance in TOLERANCES:
+        # A looser tolerance is a worse solution: it is tried only where daqp does not end with the one before.
         e, _, flag, found = daqp.solve(
             identity, target, rows, upper, lower, sense, primal_tol=tolerance, sing_tol=PARALLEL
         )
@@ -66,6 +67,7 @@ def find_least_distance(
 
 def nearest_feasible(constraints: LinearConstraints, theta: FloatArray, size: FloatArray | float = 1.0) -> FloatArray:
     """Return the feasible point nearest to theta (d,), up to rounding, each unknown being measured by its size (d,)."""
+    # Bit for bit what it was where nothing is to be done.
     if np.all(constraints.slack(theta) >= 0.0):
         return theta
     # In units of the sizes, and of the largest violation: min ||s||^2 subject to lower <= N s <= upper.

@@ -53,6 +53,8 @@ def search(oracle: Oracle, state: State, direction: SearchDirection) -> Accepted
         return _search_in_region(oracle, state, direction)
     if direction.descends:
         return _descend(oracle, state, direction)
+    # The full step goes across breakpoints: beside a minimum far from the start a step passes hundreds of samples,
+    # whose kinks are small beside the curvature of the whole. Piece by piece a fit would take an iteration a sample.
     alpha, crossing, k = 1.0, problem.breakpoints.count_crossed(theta, direction.step) > 0, 0
     while k < MAX_BACKTRACKS and not _is_hopeless(state, direction, k, alpha):
         # Across breakpoints the slope at theta says little: a larger part of the decrease is asked for, until few are
@@ -134,6 +136,7 @@ def _descend(oracle: Oracle, state: State, direction: SearchDirection) -> Accept
             break
         alpha *= 0.5
         longer, direction = direction, find_direction(problem, state._replace(metric=alpha * state.metric))
+    # The last step that failed, of twice the length, may have ended beyond a breakpoint at which J is lowest.
     crossed = 0 if longer is direction else problem.breakpoints.count_crossed(theta, longer.step)
     if accepted is None or 0 < crossed < algebra.MANY_BREAKPOINTS:
         piece = problem.breakpoints.piece(theta, problem.constraints)
@@ -157,6 +160,8 @@ def _attempt(
     there = move(problem, theta, direction.step if alpha == 1.0 else alpha * direction.step, state.scale)
     first = None if there.is_at(theta) else oracle.first(there)
     found = _judge(oracle, state, direction, there, first, alpha, fraction)
+    # The constraints bend: a full step along their tangent leaves them by the square of its length, and the merit
+    # function refuses it however near the solution is (Maratos). From there, the shortest step back.
     if first is None or found is not None or not correcting:
         return found
     moved = correct(oracle, there, first, state.scale)
@@ -184,6 +189,8 @@ def _judge(
     if first is None:
         return None
     point, penalty, constrained = state.point, state.penalty, bool(oracle.problem.equalities)
+    # Noise: J is compared to a part of itself only. Steps below it are judged by the residuals, and may not rise above
+    # the lowest J so far by more than it: else J could creep up by rounding, iteration by iteration.
     merit, before = measure_merit(first, state), measure_merit(point.plus, state)
     noise = algebra.COST_NOISE * (abs(point.cost) + penalty * point.violation)
     # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.

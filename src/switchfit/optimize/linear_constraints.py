@@ -58,6 +58,8 @@ class LinearConstraints:
     def _exact(self) -> dict[int, tuple[int, int, float]]:
         found = {}
         for k, (row, bound) in enumerate(zip(self.A, self.b.tolist(), strict=True)):
+            # theta_i - theta_j >= 0 holds exactly where both are the same number; with a duration in between, or other
+            # factors, rounding decides on which side of 0 the sum is.
             places = np.flatnonzero(row)
             if np.any(np.abs(row[places]) != 1.0):
                 continue
@@ -96,6 +98,8 @@ class LinearConstraints:
         size : float
             Of the largest unknown; rounding is a part of it.
         """
+        # One comparison for all constraints, of the largest rounding of any: it saves the rows of `is_active` and the
+        # steps bit by bit of `feasibility` at most points. Twice the reach of these, to be on the safe side.
         A, b = self._largest_sizes
         return algebra.smallest(slack) > 32 * algebra.EPS * (b + max(A, 1.0) * size)
 

@@ -49,6 +49,7 @@ def raise_penalty(penalty: float, point: Point, direction: SearchDirection) -> f
     gain = point.violation - direction.left
     # The model without its curvature where that is negative, sigma of [1].
     rise = max(-direction.reduction, direction.slope)
+    # No penalty makes a step descend that gains nothing of the violation; where J falls by itself, none is needed.
     if gain <= 1e-14 * point.violation or rise <= 0.0:
         return penalty
     needed = rise / ((1.0 - SHARE) * gain)

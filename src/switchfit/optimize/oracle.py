@@ -71,6 +71,7 @@ class Oracle:
             equalities = Equalities(c / self.units, A / self.units[:, None])
             violation = algebra.norm(equalities.values)
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
+        # Without a Hessian the result has one of NaN; nothing but steepest descent goes on with it.
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
         hessian: Hessian = given if isinstance(given, Arrow) else Dense.of(given, d)
         if not (math.isfinite(cost) and algebra.is_finite(gradient)):
@@ -96,6 +97,9 @@ class Oracle:
     def first(self, trial: Trial) -> Sample | None:
         """Do the evaluation that suffices to judge the cost."""
         kink, side = self._sides(trial)
+        # The side of the first evaluation is the one that a point off all kinks needs: right, but for coordinates on a
+        # breakpoint and an upper bound, which have a left side alone. A trial that is refused has cost one evaluation
+        # then, and one that is accepted is complete unless a coordinate has both sides.
         only_left = kink is None and side is not self._no_side and (side < 0).any() and not (side > 0).any()
         return self.sample(trial.theta, -1 if only_left else 1)
 
@@ -152,6 +156,7 @@ class Oracle:
             return optimality, values[:count], downhill, values[count + k :] - values[count : count + k]
         # The distance from the cone of the inequalities and the span of A is one within the null space of A.
         rows = JacobianSVD.of(A)
+        # ‖g − N'mu + A'lam‖ over lam of either sign is the length of what is left in the null space of A.
         reduced = rows.null.T.dot(plus.gradient)
         optimality, values = kkt_residual(reduced, reduced, normals.dot(rows.null))
         return optimality, values, side, rows.multipliers(plus.gradient - normals.T.dot(values))
@@ -176,6 +181,8 @@ class Oracle:
         kink, side = np.zeros(theta.size, dtype=bool), np.zeros(theta.size, dtype=int)
         lower, upper = self.problem.constraints.lower, self.problem.constraints.upper
         for i in trial.on_breakpoint:
+            # +1: room to the right alone, -1: to the left alone, 0: on both sides, a kink; or on none, where the bounds
+            # fix the coordinate.
             room = int(theta[i] < upper[i]) - int(theta[i] > lower[i])
             kink[i], side[i] = room == 0 and lower[i] < upper[i], room
         return kink if kink.any() else None, side

@@ -131,6 +131,8 @@ class Point:
         plus, minus = self.plus, self.minus
         if plus is minus:
             return plus.gradient, plus.hessian
+        # Two evaluations serve any number of kinks, although there are 2^k pieces around k of them: to first order J is
+        # separable at breakpoints (`first_order`), so that one derivative is right by what its own coordinate does.
         gradient = algebra.mix_sides(plus.gradient, minus.gradient, sides)
         return gradient, plus.hessian.mix_sides(minus.hessian, sides.astype(float))
 

@@ -6,7 +6,7 @@ region) or replaced by their absolute values ([1]_, section 3.4).
 
 References
 ----------
-.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4, 16.7 and 17.4.
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4, 4.3 and 17.3.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.optimize import algebra, lapack, positive_definite
+from switchfit.optimize import algebra, lapack
 
 Change = Callable[[FloatArray], FloatArray]
 """Returns another matrix (d, d)."""
@@ -33,7 +33,9 @@ def make_convex_on_face(scaled: FloatArray, normals: FloatArray, make_definite: 
     """Return a positive definite matrix that differs from a scaled one across the normals alone if that is enough."""
     across = algebra.unit_rows(normals)[0]
     across = across.T @ across
-    # H + sigma N'N is H on the face, and positive definite for a large sigma if and only if H is there ([1]_, 17.4).
+    # At a vertex of the constraints H may have any curvature across them: J need not be convex where no step can go.
+    # H + sigma N'N is H on the face, and positive definite for a large sigma if and only if H is there ([1]_, theorem
+    # 17.5), so that Newton's step on the face, and with it the quadratic rate, stays what it is.
     for stiffness in STIFFENINGS if len(normals) else ():
         stiff = scaled + stiffness * across
         if has_curvature(stiff):
@@ -121,6 +123,8 @@ def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArra
         return symmetric, True
     values = lapack.dsyev(symmetric, compute_v=0)[0]
     lowest, highest = float(values[0]), float(values[-1])
+    # The step is the longer, the smaller the least eigenvalue after the shift: it is relative to the largest one, since
+    # the matrix may have any unit, or the curvature `least` that its caller asks for.
     margin = max(algebra.EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
     if lowest > margin:
         return symmetric, True

@@ -23,7 +23,8 @@ from switchfit.optimize.linear_constraints import LinearConstraints
 from switchfit.optimize.positive_definite import CholeskyFactor
 
 SHORT_STEP = 0.01
-"""Part of Newton's step, in the metric of the matrix, below which a step is refined: it has the other's rounding."""
+"""Part of Newton's step, in the metric of the matrix, below which a step is refined: of the sixteen digits of q, with
+which e is found, two or more are lost in e itself."""
 
 OUTSIDE = 1e-8
 """Part of a step by which it may leave the room. The tolerance of daqp is one in the metric of the matrix: a million
@@ -100,6 +101,7 @@ class Room(NamedTuple):
         products, size = self.normals.dot(step), algebra.largest(np.abs(step))
         if max(algebra.largest(self.lower - products), algebra.largest(products - self.upper)) <= OUTSIDE * size:
             return step
+        # The nearest step inside, in units of the step's size: one more least-distance problem, of rows alone.
         rows, lengths = algebra.unit_rows(self.normals)
         low, high = (self.lower - products) / (size * lengths), (self.upper - products) / (size * lengths)
         found = find_least_distance(np.zeros(step.size), rows, low, high)
@@ -123,6 +125,7 @@ def solve_programme(
     step, pull : arrays, shape (d,), (m + d,)
         ``B d + g = Nᵀ pull``, positive where a lower bound presses and negative where an upper one does.
     """
+    # The usual case: nothing is in the way, at the price of two triangular solves.
     newton = newton_step(gradient, matrix, factor)
     if room.holds(newton):
         return newton, np.zeros(len(room.lower))
@@ -135,6 +138,8 @@ def solve_programme(
     if found is None:  # the zero step is feasible; a search along it ends at once
         return np.zeros(gradient.size), np.zeros(lower.size)
     e, pull = found
+    # Where constraints cut nearly all of Newton's step, e is the small difference of two vectors of length one, and has
+    # lost the digits that they share.
     if algebra.norm(e) < SHORT_STEP:
         # One step of refinement, with a residual that is computed with B itself: the same programme for the error, with
         # what is active now.

@@ -93,6 +93,8 @@ def _solve_on_sides(
     if problem.equalities:
         return _solve_constrained(problem, state, sides, room, free)
     # After a failed line search each unknown is taken by itself.
+    # With the diagonal alone each unknown moves by its own curvature: a Hessian whose off-diagonal entries are wrong,
+    # as beside a jump that is no breakpoint, couples nothing then.
     labels = np.arange(d, dtype=float) if state.careful else problem.labels
     # Curvature of each unknown that counts as none.
     floor = algebra.curvature_floor(state.scale, state.cost_scale, point.largest_slopes)
@@ -106,6 +108,7 @@ def _solve_on_sides(
     pressed = constraints.normals[point.multipliers > 0.0 if point.active.size else slice(0)]
     kept, part, own, reach = matrix, NO_PLACES, gradient, problem.reach
     if free is not None:
+        # All unknowns are fixed by their bounds, or held at kinks: a minimum, or one that the multipliers will release.
         if not free.any():
             return SearchDirection(np.zeros(d), 0.0, 0.0, False, state.radius, descends)
         # What is held is left out, or decoupled.
@@ -114,6 +117,8 @@ def _solve_on_sides(
         room, reach = room.of(part, free), reach[part]
     convex, factor = kept.convexify(pressed, floor, reach if problem.hessian == "auto" else None)
     definite, radius = convex is kept, state.radius
+    # As long as H is positive definite and its steps succeed, no box is in the way, and the fit of a good guess is
+    # plain Newton. The first indefinite H brings the region about.
     if problem.hessian == "auto" and radius == np.inf and not definite:
         radius = FIRST_RADIUS
     if radius < np.inf:
@@ -157,8 +162,11 @@ def _room(
     lower, upper = room.bounds
     # Rows that hold up to rounding hold exactly in the programme.
     if point.active.size:
+        # A slack of an ulp would let the step go there, and the next one again: each iteration would end at the same
+        # row.
         room.lower[point.active[point.active < constraints.b.size]] = 0.0
     if piece is not None:
+        # A step of zero stays feasible, for whatever rounding has done to theta.
         lower[:] = np.minimum(piece[0] - point.theta, 0.0)
         upper[:] = np.maximum(piece[1] - point.theta, 0.0)
     if point.kink is None and point.idle is None and constraints.movable.all():
@@ -175,5 +183,6 @@ def _descends(problem: MinimizationProblem, hessian: Hessian, free: BoolArray | 
     """Return whether the step is one of steepest descent."""
     if problem.hessian != "descent-first":
         return not problem.uses_hessian
+    # Held coordinates do not move: whether H is positive definite along them does not matter.
     kept = (hessian if free is None else hessian.keep(free)[0]).dense()
     return kept.size > 0 and not is_definite(kept)

@@ -123,11 +123,14 @@ def _find_unbounded(problem: MinimizationProblem, state: State) -> search_direct
 def _step(oracle: Oracle, state: State) -> State:
     """Do one iteration: return the next state, or the same point with a status."""
     problem = oracle.problem
+    # Direction: [1]_, sections 18.1 and 18.5. It comes before the test of convergence, which asks for its length.
     direction = search_direction.find_direction(problem, state)
     if _is_settled(problem, state, direction):
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.iteration >= problem.max_iterations:
         return state._replace(status=Status.MAX_ITERATIONS)
+    # A local minimum of the violation: linearized constraints that contradict one another, as guards that a trajectory
+    # no longer reaches. The line search would make ever smaller steps there ([1]_, section 17.2).
     if problem.equalities and merit.is_stuck(oracle, state):
         return state._replace(status=Status.INFEASIBLE)
     # Before the line search: it would accept steps that change J by rounding alone.
@@ -137,6 +140,7 @@ def _step(oracle: Oracle, state: State) -> State:
     accuracy = 0.0 if problem.accuracy is None else problem.accuracy()
     if accuracy and direction.reduction <= accuracy * abs(state.point.cost) and state.point.violation <= MET:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
+    # Line search: across breakpoints, then inside the piece; see `line_search`.
     accepted = line_search.search(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
@@ -157,7 +161,9 @@ def _is_settled(problem: MinimizationProblem, state: State, direction: search_di
     """Return whether the optimality is below the tolerance and the next step negligible, for J may be badly scaled."""
     if not state.point.is_stationary(problem.tolerance):
         return False
-    # Without a Hessian the step says nothing about the distance to the minimum.
+    # Without a Hessian the step says nothing about the distance to the minimum. With one, a small gradient alone is no
+    # end: along an unknown of the size 1e6 a gradient of 1e-7 may be a step of its whole size away. A few iterations
+    # later it is, for a step need not become negligible where J is flat.
     if not problem.uses_hessian or state.settled >= algebra.EXTRA_ITERATIONS:
         return True
     return bool(algebra.is_negligible(direction.step, state.scale))
@@ -185,6 +191,8 @@ def _handle_stall(oracle: Oracle, state: State, direction: search_direction.Sear
     if state.point.violation > MET:
         return state._replace(status=Status.INFEASIBLE)
     # The derivatives are rounded relative to their largest terms: those seen so far, and |H| |theta|.
+    # A gradient is the difference of terms that may each be large: at the end of a fit with a far start, or with
+    # unknowns of unlike size, what is left of it cannot be below their rounding.
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
         floor = max(floor, float(np.max(state.point.plus.hessian.absolute().dot(state.scale))))
@@ -212,6 +220,7 @@ def _finish(oracle: Oracle, state: State, direction: search_direction.SearchDire
     problem = oracle.problem
     if problem.uses_hessian or state.point.plus.hessian.finite:
         closed = close_gaps(oracle, state)
+        # The usual end of a fit needs no eigenvalues.
         if closed is state and direction.regular:
             # The matrix of the programme was H itself: its scaled eigenvalues are above EIGENVALUE_FLOOR.
             return state._replace(status=status)

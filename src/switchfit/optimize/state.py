@@ -88,11 +88,15 @@ class State(NamedTuple):
     def advance(self, accepted: Accepted, tolerance: float) -> State:
         """Return the state after an accepted step."""
         point, alpha = accepted.point, accepted.step_length
+        # Compared with the value at the last change, not with the one before: a violation that creeps down by 1 % an
+        # iteration is not stuck, and leaves the tenth after ten of them.
         steady = abs(point.violation - self.steady_violation) <= 0.1 * self.steady_violation
         return State(
             point=point,
             iteration=self.iteration + 1,
             step_length=alpha,
+            # Twice the last length, for the curvature ahead may be smaller; never below 1, the first guess, so that one
+            # hard place does not make all steps behind it short.
             metric=max(1.0, 2.0 * alpha * self.metric),
             settled=self.settled + 1 if point.is_stationary(tolerance) else 0,
             scale=np.maximum(self.scale, np.abs(point.theta)),
@@ -124,6 +128,7 @@ class State(NamedTuple):
         point, constraints = self.point, problem.constraints
         hessian = point.derivatives(point.reported_sides)[1]
         flat = algebra.flatness(self.scale, self.cost_scale)  # curvature that is rounding
+        # A kink holds its coordinate by the jump of a derivative, whatever the curvature on its sides is.
         held = self.genuine_kinks | ~constraints.movable
         held = held if point.idle is None else held | point.idle
         normals = np.vstack([constraints.normals[rows], point.equalities(point.reported_sides).jacobian])
@@ -132,6 +137,8 @@ class State(NamedTuple):
             bounds = point.active[point.active >= constraints.b.size]
             # Bounds that hold nothing back.
             loose = np.any(point.multipliers[bounds] <= 1e-10 * self.gradient_scale)
+            # To ask for all idle coordinates costs an evaluation: only where the curvature does not tell a minimum
+            # anyway, or a bound is active without a force, which may be one of a mode that has collapsed.
             if found.spectrum.smallest <= algebra.EIGENVALUE_FLOOR or loose:
                 idle = problem.idle(point.theta.copy(), True) & ~held
                 if idle.any():
@@ -147,6 +154,7 @@ class State(NamedTuple):
             return tuple(sorted(alone))
         idle = set(np.flatnonzero(point.idle).tolist())
         ties = [{i, j} for i, j, _ in problem.constraints.exact_rows(point.active) if j >= 0]
+        # Chains of times: each round carries the idle ones a tie further, and there are no more rounds than ties.
         for _ in ties:
             idle |= {k for tie in ties if tie & idle for k in tie}
         return tuple(sorted(idle | alone))

@@ -2,6 +2,10 @@
 
 A collapsed mode whose duration is an ulp above 0 would count as free, with the curvature of J in its duration; and a
 KKT point with negative free curvature is no minimum. The SQP comes here before it ends.
+
+References
+----------
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, section 12.5 (second-order conditions).
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ def close_gaps(oracle: Oracle, state: State) -> State:
     all the same if a step from there is negligible.
     """
     problem, point = oracle.problem, state.point
+    # A gap of 1e-10 of the horizon: below what the optimizer calls negligible, and far above rounding.
     theta = snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), algebra.NEGLIGIBLE_STEP)
     if np.array_equal(theta, point.theta):
         return state
@@ -46,6 +51,7 @@ def close_gaps(oracle: Oracle, state: State) -> State:
 def escape(oracle: Oracle, state: State) -> Accepted | None:
     """Return a step along negative curvature: on the face of the pressing constraints, then of all active ones."""
     problem = oracle.problem
+    # Second-order conditions hold on the critical cone, along which constraints with a force stay active ([1]_).
     pressing = np.flatnonzero(state.point.multipliers > max(problem.tolerance, 1e-10 * state.gradient_scale))
     active = state.point.active
     # A constraint without force may be left along negative curvature: only pressing ones confine the ray at first.
@@ -53,6 +59,7 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
         curvature = state.curvature_at(problem, rows)
         if not curvature.spectrum.smallest < NEGATIVE_CURVATURE:
             continue
+        # To second order J falls alike to both sides; farther on one of them may lead out of the saddle alone.
         for ray in (curvature.spectrum.lowest, -curvature.spectrum.lowest):
             accepted = _descend_along(oracle, state, ray)
             if accepted is not None:
@@ -67,6 +74,8 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
     bending = float(ray @ hessian.dot(ray))
     sized = state.scale > 0.0
     relative = float(np.max(np.abs(ray[sized]) / state.scale[sized], initial=0.0))
+    # How far negative curvature reaches is not known: a tenth of the unknowns' size is long enough to leave a saddle
+    # for good, and is halved where J rises.
     length = 0.1 / relative if relative > 0.0 else 0.1 / float(np.max(np.abs(ray)))
     # No further than the first inactive constraint that the ray approaches.
     normals = problem.constraints.normals

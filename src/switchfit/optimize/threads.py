@@ -44,6 +44,8 @@ def find_libraries() -> tuple[Library, ...]:
     for name in BLAS_MODULES:
         with suppress(ImportError, OSError, TypeError):  # a build without this module, or with it in the interpreter
             module = ctypes.CDLL(import_module(name).__file__)
+            # Names of the wheels of NumPy and SciPy (their own build of OpenBLAS, with 64-bit integers or not), then
+            # those of a system's library.
             for affixes in ("scipy_{}64_", "scipy_{}", "{}64_", "{}"):
                 get, put = (affixes.format(f"openblas_{verb}_num_threads") for verb in ("get", "set"))
                 if hasattr(module, put):
@@ -58,6 +60,7 @@ def _count(change: int) -> None:
     libraries = find_libraries()
     with _lock:
         if change > 0 and _inside == 0:
+            # Only those that are not at one thread already: nothing is to be restored then, and no call made.
             _before[:] = [(put, count) for get, put in libraries if (count := get()) != 1]
             for put, _ in _before:
                 put(1)

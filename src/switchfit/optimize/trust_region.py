@@ -48,10 +48,13 @@ def next_radius(
 ) -> float:
     """Return the radius that follows an accepted step, from the actual and the predicted decrease and their error."""
     radius = direction.radius
+    # A ratio of two numbers that are rounding says nothing about the model.
     if predicted <= noise or not problem.has_region:
         return radius
     ratio = decrease / predicted
     if ratio < POOR:
         return min(radius, get_shrink_factor(problem) * measure_in_box(problem, direction.step))
+    # It grows only where the region has cut the step: the model was good there, which says nothing about how good it is
+    # farther out ([1]_, algorithm 4.1).
     grows = ratio > GOOD and radius < math.inf and measure_in_box(problem, direction.step) > 0.9 * radius
     return GROW * radius if grows else radius

@@ -22,5 +22,6 @@ def compile_small_loops_whole() -> None:
     It has no effect if JAX has run something before switchfit is imported; results are then the same, but slower.
     """
     flags = os.environ.get("XLA_FLAGS", "")
+    # One value of the option holds all extra options of XLA: a second one would replace what the user has set.
     if OPTION not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {SMALL_LOOPS}".strip()

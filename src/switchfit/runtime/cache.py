@@ -64,6 +64,8 @@ def get_usable_folder() -> Path | None:
         return None
     path = Path(chosen) if chosen else Path(platformdirs.user_cache_dir("switchfit", appauthor=False))
     try:
+        # Code in the folder will be run: it is made for its owner alone, and looked at afterwards, for it may have been
+        # there.
         path.parent.mkdir(parents=True, exist_ok=True)
         path.mkdir(mode=0o700, exist_ok=True)
         found = path.stat()
@@ -79,6 +81,7 @@ def _find_other_writers(found: os.stat_result) -> str:
     """Return why others may have written a file or a folder; "" if they cannot, or the system does not tell."""
     if not hasattr(os, "geteuid"):
         return ""
+    # Another owner could change the permissions at any time.
     if found.st_uid != os.geteuid():
         return f"it belongs to the user with the number {found.st_uid}, not to you ({os.geteuid()})"
     if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
@@ -105,10 +108,13 @@ def read_code(path: Path) -> bytes | None:
     """
     try:
         with path.open("rb") as file:
+            # Of the open file, not of its name: between two look-ups by name another file may have been put there.
             found = os.fstat(file.fileno())
             content = file.read()
     except OSError:
         return None
+    # A file cut short by a full disk or a killed process has another digest: it counts as missing, and is written
+    # again.
     check, code = content[:32], content[32:]
     return code if hashlib.sha256(code).digest() == check and not _find_other_writers(found) else None
 
@@ -147,4 +153,5 @@ def _use_whole_files(path: Path) -> None:
     """Replace JAX's cache by `_WholeFiles`. The names are private: if JAX changes them, its own cache remains."""
     internals: Any = sys.modules[jax_cache.reset_cache.__module__]
     with getattr(internals, "_cache_initialized_mutex", nullcontext()):
+        # Under JAX's own lock, which guards the two together; another thread may be compiling.
         internals._cache_initialized, internals._cache = True, _WholeFiles(path)

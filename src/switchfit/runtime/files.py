@@ -34,12 +34,16 @@ def write_atomically(content: str | bytes, path: Path, *, sync: bool = True) -> 
         path.write_bytes(data)  # a device or a pipe, which cannot be replaced
         return
     path = path.resolve()  # write the target of a link; the link remains
+    # In the same folder, so that the rename stays on one file system; a random name, for others may write the same
+    # file.
     temporary = path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
     try:
+        # Never a file that is there: "x" fails on a link that somebody has put in its place.
         with temporary.open("xb") as file:
             file.write(data)
             file.flush()
             if sync:
+                # A rename may reach the disk before the content does: after a loss of power the file would be empty.
                 os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
@@ -60,9 +64,11 @@ def explain_read_errors(path: Path, what: str = "file", inside: str = "a file") 
     what, inside : str
         What it is, and what to name in a folder, for messages.
     """
+    # The operating system would say "embedded null byte", as a ValueError without the name.
     if "\0" in str(path):
         raise InputError(f"{str(path)!r} is not a file name: it has a null character.")
     try:
+        # Before it is opened: to open a device may change it, and to read one may never end.
         if path.is_char_device() or path.is_block_device():
             raise InputError(f"{path} is a device; name a {what}.")
         yield

@@ -96,6 +96,7 @@ def build_pandas(frame: Frame) -> pandas.DataFrame:
     units = {}
     for column in (*frame.index, *frame.columns):
         number, name = 1, column.name
+        # A state and a parameter may have one name, and so may outputs of two sensors.
         while name in found:
             number += 1
             name = f"{column.name} {number}"

@@ -49,6 +49,7 @@ def parse_document(text: bytes, path: Path, what: str, form: str, version: int) 
     """
     try:
         content = json.loads(text.decode())
+    # RecursionError: a file of nothing but opening brackets.
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not {what}: it is not valid JSON ({error}).") from error
     if not isinstance(content, dict) or content.get("format") != form:
@@ -69,6 +70,8 @@ def _lay_out(value: object, indent: str = "") -> str:
     elif isinstance(value, list) and any(isinstance(entry, (dict, list)) for entry in value):
         entries = [_lay_out(entry, deeper) for entry in value]
     else:
+        # Numbers that are not finite have become strings before (`json_records`): one here is a mistake, not "NaN" in a
+        # file that other programs refuse.
         return json.dumps(value, allow_nan=False, ensure_ascii=False)
     opening, closing = "{}" if isinstance(value, dict) else "[]"
     return f"{opening}\n{deeper}" + f",\n{deeper}".join(entries) + f"\n{indent}{closing}"

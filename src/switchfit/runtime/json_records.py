@@ -95,10 +95,12 @@ def _read(kind: Annotation, content: Json) -> Any:
         return _read_either(inner, content)
     if isinstance(kind, type) and is_dataclass(kind):
         hints = _get_hints(kind)
+        # Both directions: an entry that is unknown is from another version, whose meaning is not known here.
         if hints.keys() != content.keys():
             raise KeyError
         return kind(**{name: _read(hint, content[name]) for name, hint in hints.items()})
     if origin is tuple and isinstance(content, list):
+        # tuple[X, ...] has one type for all entries, tuple[X, Y] one for each.
         kinds = inner[:1] * len(content) if inner[-1] is Ellipsis else inner
         return tuple(_read(*pair) for pair in zip(kinds, content, strict=True))
     if isinstance(origin, type) and issubclass(origin, Mapping):
@@ -109,6 +111,7 @@ def _read(kind: Annotation, content: Json) -> Any:
         return inner[inner.index(content)]
     if issubclass(kind, Enum):
         return kind[content]
+    # JSON has one kind of number: 1.0 may have been written as 1 by another program.
     if kind is float and (type(content) is int or content in NONFINITE_NUMBERS):
         return float(content)
     if type(content) is not kind:
@@ -121,6 +124,8 @@ def _read_either(kinds: tuple[Annotation, ...], content: Json) -> Any:
     if content is None and NoneType in kinds:
         return None
     for kind in kinds:
+        # In the order of the union: the types of one union differ in what they read, so that the first that fits is
+        # meant.
         with suppress(Exception):
             return _read(kind, content)
     raise TypeError
@@ -158,6 +163,7 @@ def _read_array(declared: np.dtype[Any], value: Json) -> NDArray[Any]:
         array = np.array(value["values"], dtype=value["dtype"]).reshape(value["shape"])
     else:
         array = np.array(value, dtype=np.float64)
+    # The kind alone, not the size: int64 and int32 are written on different systems.
     if array.dtype.kind != declared.kind:
         raise TypeError
     return array

@@ -61,6 +61,7 @@ class Line:
 
     def draw(self) -> None:
         """Draw the line, after `DELAY` seconds, until the call ends."""
+        # Most calls end before it is shown: they have cost a thread, and nothing was imported for drawing.
         if self.ended.wait(DELAY):
             return
         with _show_below(self) if _is_notebook() else _show_on_terminal(self) as redraw:
@@ -88,6 +89,7 @@ def _show_on_terminal(line: Line) -> Iterator[Callable[[], object]]:
     from rich.console import Console
     from rich.live import Live
 
+    # What else is printed during the call goes above the line; where stdout is a file or a pipe it is left alone.
     console, redirect = Console(stderr=True), _is_terminal(sys.stdout)
     settings: dict[str, Any] = {"redirect_stdout": redirect, "redirect_stderr": redirect, "auto_refresh": False}
     with Live(line, console=console, transient=True, **settings) as live:
@@ -115,6 +117,7 @@ def show_line(text: str) -> Iterator[Line]:
     A call inside another one, or outside the main thread, gets a line that is not shown.
     """
     line = Line(text)
+    # A line of a call inside another one would be drawn over the outer one; beside the main thread nobody looks.
     is_first = _current.get() is None and threading.current_thread() is threading.main_thread()
     line.is_shown = is_first and (_is_terminal(sys.stderr) or _is_notebook())
     token = _current.set(line)
@@ -126,6 +129,7 @@ def show_line(text: str) -> Iterator[Line]:
         yield line
     finally:
         _current.reset(token)
+        # Joined before the call returns: nothing is drawn over what the caller prints next.
         line.ended.set()
         if line.is_shown:
             thread.join()

@@ -33,6 +33,7 @@ def stop_clock() -> Iterator[None]:
 
 
 def _count_compilation(event: str, duration_secs: float, **kwargs: str | int) -> None:
+    # Whatever thread compiles: the clock is that of a limit of time for the whole process.
     if event in COMPILING:
         _compiled[0] += duration_secs
 

@@ -101,6 +101,8 @@ class Integrator:
         # Modes that were found stiff take implicit steps here, which the structure does not say yet: a program apart.
         chosen = take_implicit_steps(structure, settings.implicit)
         if course is None or course.branches.count:
+            # A solver is kept for the coarse mesh alone, which lives as long as the run; others would pile up mesh by
+            # mesh.
             known = run.solvers.__dict__ if coarse is run.coarse else {}
             key = f"{'' if course is None else course.branches.version} {chosen.implicit}"
             if key not in known:
@@ -112,11 +114,13 @@ class Integrator:
     def __call__(self, tau: FloatArray, p: FloatArray) -> FloatArray:
         """Return the accepted times from t0 to tf, strictly increasing."""
         structure, experiment, self._p = self._structure, self._experiment, p
+        # Of a free tf `end` is its upper bound; the last transition is tf then, and the rest behind it the last mode.
         ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
         steps, x = [ends[:1]], self._find_initial_state()
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 x = self._apply_reset(i - 1, ends[i], x)
+            # Strictly inside: a knot at a transition is the end of the stretch already.
             inside = (self._stops > ends[i]) & (self._stops < ends[i + 1])
             stops = np.concatenate([[ends[i]], self._stops[inside], [ends[i + 1]]])
             name = structure.mode_names[mode]
@@ -166,6 +170,7 @@ class Integrator:
         native = self._native
         if native is not None and self._problem.engine != "jax" and name in native.structure.mode_names:
             place = native.structure.mode_names.index(name)
+            # Machine code that was compiled for the other method counts other operations.
             if native.structure.implicit[place] is not is_explicit:
                 return native.row_work[place]
         return ROWS_BY_JAX[is_explicit]
@@ -176,6 +181,7 @@ class Integrator:
         # From branch to branch: each ends where the trajectory crosses a corner, at a state on the cubic of the step.
         while True:
             accepted, x, crossing = self._solve(stretch)
+            # A crossing at the very start of the stretch, as after another one, is no step.
             steps.append(accepted[accepted > stretch.start])
             if crossing is None or self._course is None:
                 return steps, x
@@ -215,6 +221,7 @@ class Integrator:
             with suppress(NativeStepsError):
                 return self._take_steps(stretch, NativeSteps(native, mode, stretch, self._p, self._tolerances), watch)
             if self._settings.most < MAX_STEPS:
+                # With few steps it is one of many trials, whose reason nobody asks for.
                 raise self._report_stuck(stretch, stretch.start, stretch.x, None)
             watch = Watch()  # machine code has counted its steps
         with use_float64(), use_compilation_cache():
@@ -247,6 +254,8 @@ class Integrator:
                     accepted += times[times < crossing.time].tolist()
                     return np.array([*accepted[1:], crossing.time]), crossing.state, crossing
             accepted += times.tolist()
+            # Without the running cost, which restarts from 0 in each stretch: it is integrated for its share in the
+            # error alone.
             x = steps.y[:-1].copy()
             # From time to time the watch estimates whether stability limits the explicit steps, from the last one of
             # them.
@@ -274,6 +283,7 @@ class Integrator:
         first, last = np.nextafter(start, end), np.nextafter(end, start)
 
         def slope(t: float, y: FloatArray) -> FloatArray:
+            # Inside the stretch by an ulp: at its ends an input may jump, and a trial step of Radau may pass them.
             cell = min(int(times.searchsorted(min(max(t, first), last), "right")) - 1, len(times) - 2)
             piece = Piece(times[cell], self._whole.signals[cell])
             given = self._arguments, piece, t, y[:-1], self._p

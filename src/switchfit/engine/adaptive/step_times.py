@@ -14,6 +14,7 @@ USUAL_SETTINGS = SolveSettings()
 
 def solve_adaptively(run: Run, theta: FloatArray, settings: SolveSettings = USUAL_SETTINGS) -> FloatArray:
     """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing."""
+    # In turn: along the path, without it, along it with more crossings, and without it after all.
     tau, p = run.vectors(theta)
     if run.branches is not None:
         try:

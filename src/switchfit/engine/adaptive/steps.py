@@ -56,6 +56,7 @@ class NativeSteps:
         self.y, (start, end) = np.append(stretch.x, 0.0), stretch[1:3]
         exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
         step = first_step(self.slope, start, self.y, end, given, exponent)
+        # The layout of memory is that of `loops.adaptive_steps`, which goes on from here in each call.
         self._state = np.zeros(len(AT))
         self._state[[AT.t, AT.step, AT.end, AT.rtol, AT.atol]] = start, step, end, *given
         # Times at which signals are read are kept strictly inside the stretch: at its ends an input may jump.
@@ -106,5 +107,6 @@ class PythonSteps:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused
             self.message = self._solver.step()
         self.t, self.y, self.is_running = float(self._solver.t), self._solver.y, self._solver.status == "running"
+        # After a step that failed SciPy's t and y are those before it: there is nothing new.
         taken = slice(int(self.message is None))
         return np.array([self.t])[taken], self.y[None, :-1][taken]

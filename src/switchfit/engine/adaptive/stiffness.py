@@ -166,6 +166,7 @@ class Watch:
         """
         mode = self.mode
         mode.count += accepted
+        # The implicit solve of a mode is given up as soon as its rows are known to take longer than the explicit ones.
         if mode.row_work * mode.count > self.most.get(self.current, np.inf):
             raise TooManyStepsError
         return mode.count - mode.looked >= (MANY_STEPS if is_last else self.between)
@@ -182,6 +183,7 @@ class Watch:
         may_stop = len(looks) in range(LOOKS_TO_STOP, 4 * LOOKS_TO_STOP, LOOKS_TO_STOP)
         if self.refused is None or self.current in self.refused or not may_stop:
             return False
+        # In a row: where a mode is stiff in a part of its time alone, explicit steps may still be fewer.
         last = looks[-LOOKS_TO_STOP:]
         rates = _measure_rates(last)
         return all(rate * look.step > LIMITED for rate, look in zip(rates, last, strict=True))
@@ -204,6 +206,7 @@ def _measure_rates(looks: Sequence[Look]) -> list[float]:
         rates = np.zeros(len(steps))
         defined = np.isfinite(jacobians).all(axis=(1, 2))  # beside the trajectory the model need not be
         eigenvalues = np.linalg.eigvals(jacobians[defined])
+        # A component that grows limits nothing: its steps are short for accuracy.
         rates[defined] = np.where(eigenvalues.real < 0, np.abs(eigenvalues), 0.0).max(axis=1, initial=0.0)
         found += rates.tolist()
     return found

@@ -28,6 +28,7 @@ def trace_for_numpy(function: Function) -> Callable[..., FloatArray]:
         try:
             template = trace_scalars(call, *shapes)
         except Unsupported:
+            # Something that has no scalars, as a custom call or a loop of unknown length.
             compiled = jax.jit(call)
         else:
             return lambda t, moving, p: template.evaluate([t], *(a.T for a in moving), *map(np.ravel, p))[0]
@@ -49,6 +50,7 @@ def are_equal(one: Function, other: Function) -> bool:
     call = lambda *given: [each.evaluate(given) for each in (one, other)]  # noqa: E731
     with use_float64():
         try:
+            # Outputs are equal where the graph has made them one node.
             return one == other or trace_scalars(call, *shapes).has_equal_outputs
         except Unsupported:
             return False

@@ -62,10 +62,14 @@ class Branches:
             corners = self.corners[mode]
             for k, sides in enumerate(each):
                 self._modes.setdefault((mode, sides))
+                # A corner that no trajectory has passed at this theta may be passed at the next one: to compile its end
+                # now costs less than to compile all anew, if corners are few.
                 every = range(len(corners.list_ends(sides))) if corners.count <= FEW_CORNERS else ends[k : k + 1]
                 self._guards |= {corners.end(sides, end): None for end in every if end >= 0}
         if len(path.times) > self._room:
             # Programs are compiled for a number of transitions: a few more crossings fit, as at another theta.
+            # Powers of two up to 32, then multiples of 16: a program compiled for many more crossings than there are is
+            # slower, for the time of an evaluation grows with their square.
             room = len(path.times) + 2
             self._room = 1 << (room - 1).bit_length() if room <= 32 else -(-room // 16) * 16
 

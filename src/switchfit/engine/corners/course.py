@@ -28,31 +28,38 @@ MOST_SLIDING, MOST_STEEP = 6, 2
 to the branch: programs of six bodies that rest compile in 40 s, and as many steep corners would take minutes."""
 
 AT_CORNER = 1e-8
-"""Part of the largest |g| so far below which a trajectory is at a corner."""
+"""Part of the largest |g| so far below which a trajectory is at a corner, where rates decide and not the sign of g:
+above what the location of a crossing and the errors of a solver leave of g = 0 at a state that is at rest."""
 
 PASSED = 1e-7
-"""The same for the end of a branch: it is passed where its function is below minus this part."""
+"""The same for the end of a branch: it is passed where its function is below minus this part. More than `AT_CORNER`, so
+that a trajectory that begins at a corner, or has just left one, does not pass it by rounding."""
 
 PASSED_STEEP = 1e-10
-"""The same for a steep corner, beside which a trajectory is slow."""
+"""The same for a steep corner. A tank that empties by sqrt(x) comes to x = 0 without a slope, and hardly falls below
+it."""
 
 STILL = 1e-6
-"""Part of the larger dg/dt of both sides below which the other is zero."""
+"""Part of the larger dg/dt of both sides below which the other is zero: forces in balance leave their rounding."""
 
 STUCK_AT_CORNER = 1e-6
-"""Part of the largest |g| so far below which a solver that is stuck is at a corner."""
+"""Part of the largest |g| so far below which a solver that is stuck is at a corner: beside a root, whose slope is
+infinite, its steps have become as short as rounding before it is any nearer."""
 
 STEEP_MARGIN = 1e-8
-"""Part of the largest |g| so far that is the margin of a steep corner."""
+"""Part of the largest |g| so far that is the margin of a steep corner: nearer to it the field is the one on the margin,
+with slopes that are finite."""
 
 NEAR_STEEP = 1e-4
-"""Part of its margin at which the rates at a steep corner are taken: well above rounding, if g is a difference."""
+"""Part of its margin at which the rates at a steep corner are taken, 1e-12 of the largest |g|: well above rounding, if
+g is a difference."""
 
 STILL_STEEP = 1e-5
-"""Part of the largest rate of all corners below which a rate at a steep corner is zero."""
+"""Part of the largest rate of all corners below which a rate at a steep corner is zero: the root of 1e-12 is 1e-6."""
 
 PARTS_OF_STEP = 16
-"""Parts in which a step is divided, three times, to find where it leaves a branch."""
+"""Parts in which a step is divided, three times, to find where it leaves a branch: of functions that cross zero twice
+in a step, the first passage, down to 1 / 4096 of the step."""
 
 
 class BranchError(Exception):
@@ -130,6 +137,7 @@ class Course:
             cells = np.clip(self._nodes.searchsorted(inside, "right") - 1, 0, len(self._signals) - 1)
             size = int(np.prod(self._structure.input_shape or ()))
             s, u, rate = np.expand_dims(np.subtract(t, self._nodes[cells]), -1), np.zeros(size), np.zeros(size)
+            # Horner's scheme, for the input and its rate at once.
             for power in reversed(range(self._signals.shape[1])):
                 rate, u = rate * s + u, u * s + self._signals[cells, power, self._signals.shape[-1] - size :]
             has_rate = function.structs[2].shape != self._structure.input_shape
@@ -174,6 +182,8 @@ class Course:
         # The branch behind the end that was passed, unless the rates of other corners there say another one.
         k, side = self.corners.list_ends(self.sides)[end]
         behind = (*self.sides[:k], side, *self.sides[k + 1 :])
+        # Corners along which it slid are left by the errors that g has gathered there; the one that is crossed has the
+        # error of its own location.
         drift = np.abs(self.evaluate(self.corners.surfaces(self.sides), t, x, inside))
         after = self._choose(behind, t, x, inside, np.where(np.array(self.sides) == 0, drift, drift[k]))
         if after == self.sides:
@@ -184,6 +194,7 @@ class Course:
         self._add(t, end, after)
 
     def _add(self, t: float, end: int, after: Sides) -> None:
+        # Ever faster switching, as of a relay without a dead band, ends here and not in a solve without end.
         if len(self._times) >= self.branches.most:
             raise TooManyCrossingsError(
                 f"mode {self._structure.mode_names[self._mode]!r} passes corners of the state ({self._list_lines()}) "
@@ -240,6 +251,7 @@ class Course:
             # A corner along which the trajectory slid is left from a state on a cubic: it may be a little beyond.
             self._beyond = 2.0 * np.minimum(self._last[0], 0.0)
         known = len(self._last)
+        # The values of the two states before are kept: a dip shows by how values change on both sides of a step.
         values = np.concatenate([self._last, self.evaluate(function, times[1:], states[1:], inside)])
         dips, values = np.asarray(find_dips(values))[known - 1 :], values[known - 1 :]
         of_end, slides = self.list_ends(self._mode, self.sides)
@@ -323,6 +335,7 @@ class Course:
         `sides` are those to begin with; at a corner that repels to both sides, the trajectory takes that one. `drift`
         is the error of g of each corner.
         """
+        # As many rounds as decisions can follow from one another; rates that contradict each other go round for ever.
         for _ in range(2 * len(sides) + 2):
             # Sides from the signs of g; where g is zero up to rounding, from its rates on both sides. One decision may
             # change the field, and with it another: each is made with those before it, until nothing changes.
@@ -375,6 +388,8 @@ def find_dips(values: FloatArray) -> BoolArray:
 
     They fall before the step and rise after it, and change by much of their size in it or beside it.
     """
+    # NaN, unknown, before the first and after the last step: a comparison with it is false, so that it excludes
+    # nothing.
     change = np.diff(values, axis=0, prepend=np.nan, append=np.nan)
     before, inside, after = change[:-2], change[1:-1], change[2:]
     largest = np.fmax(np.fmax(np.abs(before), np.abs(after)), np.abs(inside))

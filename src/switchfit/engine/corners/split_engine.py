@@ -45,16 +45,20 @@ CROSSING_ITERATIONS, STEADY_ITERATIONS = 40, 8
 """After the second number steps have to become shorter: they halve where a crossing is nearly a tangent."""
 
 TURNS = 0.25
-"""Part of the last dg/dsigma below which the next one is beside an extremum of g: it halves at a tangent."""
+"""Part of the last dg/dsigma below which the next one is beside an extremum of g: it halves at a tangent, where g is a
+square and Newton's steps halve the distance."""
 
 IDLE_ITERATIONS = 3
 """The same for crossings that change nothing: they may be tangents, and are where they are as far as `_holds` sees."""
 
 CROSSING_FOUND, CROSSING_NEAR = 1e-15, 1e-8
-"""Newton steps of the times of crossings, relative to the horizon, at which they are found: before and after it."""
+"""Newton steps of the times of crossings, relative to the horizon, at which they are found: before and after it. A step
+of 1e-8 leaves an error of its square, so that no evaluation is spent on seeing that."""
 
 MAY_END = 1e-6
-"""Part of the largest value of the function of an end below which a branch has passed it at a row."""
+"""Part of the largest value of the function of an end below which a branch has passed it at a row: ten times what the
+adaptive solve allows (`course.PASSED`), for rows of the mesh have errors of their own, and a path that just holds would
+be looked for anew at each theta."""
 
 LOST = "the trajectory cannot be followed through the corners of its modes at the guess: use a better guess."
 
@@ -226,11 +230,13 @@ class SplitEngine:
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`; crossings are nodes of the simulation."""
         split, found = self._solve(tau, p, 1.0)
+        # States can be shown up to where the path is lost; derivatives are those of a path that holds.
         split = split or (None if tangents else self._split)
         if split is None:
             raise NotIntegrableError(LOST)
         times = self._move_own(split, tau)
         inner = split.engine.simulate(times, p, tangents=tangents)
+        # Users see the experiment's own segments, with crossings as nodes inside them: cells = rows - segments again.
         begins = np.append(0, 1 + split.own)[: len(self._structure.mode_of_segment)]
         own = inner.first_row[begins[begins < len(inner.first_cell)]]  # without the rest after a free tf
         nodes = np.sort(np.concatenate([inner.nodes, times[split.crossings]]))
@@ -305,6 +311,7 @@ class SplitEngine:
     def _take(self, path: BranchPath) -> _Split:
         """Keep a path with the times of its crossings."""
         split, corners = self._split, self._branches.corners
+        # Programs and engine stay as long as the branches do, though the times change with each theta.
         known = None if split is None else (split.path.sides, split.path.ends, split.corners)
         if split is None or known != (path.sides, path.ends, corners):
             structure = self._branches.get_structure(self._structure, path)
@@ -320,6 +327,7 @@ class SplitEngine:
             places = own, crossings, guarded, idle, others, guards, idle_guards
             split = _Split(path, corners.copy(), structure, self._build_engine(structure), *places)
         self._split, self._times = split, np.zeros(len(split.own) + len(split.crossings))
+        # From here Newton's method starts at the next theta.
         self._times[split.crossings] = path.times
         return split
 
@@ -353,6 +361,7 @@ class SplitEngine:
                 step = np.linalg.solve(square, found.constraints[split.guards])
             except np.linalg.LinAlgError:
                 break
+            # How far each crossing moves, as a part of the horizon, and how far from its corner it is.
             own, g = np.abs(step) / (ends[1] - ends[0]), np.abs(found.constraints[split.guards])
             size = float(own.max(initial=0.0))
             if not np.isfinite(size):

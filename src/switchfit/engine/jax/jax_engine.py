@@ -75,6 +75,8 @@ class JaxEngine:
 
     def _run(self, program: Callable[..., Any], *given: Traced, **settings: object) -> Any:
         """Return what a program yields for the experiment; only once it looks for it among the compiled ones."""
+        # The persistent cache is asked once a program: to enter and leave it changes JAX's configuration. Shapes are
+        # those of this experiment and mesh in all calls.
         key = program, *settings.values()
         with use_float64(), nullcontext() if key in self._compiled else use_compilation_cache():
             found = program(self._on_device, *given, structure=self._any_sequence, **settings)
@@ -101,6 +103,7 @@ class JaxEngine:
 
     def slopes(self, times: FloatArray, cells: IntArray, states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
+        # Padded by repeating points, which are inside the domain of the model.
         count, padded = len(times), pad_length(len(times))  # for few different programs
         pieces = Piece(self._arguments.nodes[cells], self._arguments.signals[cells])
         points = jax.tree.map(lambda a: np.resize(a, (padded, *a.shape[1:])), (times, states, pieces))

@@ -71,6 +71,7 @@ def derivatives(
         row, (J, lagrangian_d, c, c_d) = _differentiate(method, slope, theta)
         return J, lagrangian_d, row, c, c_d
 
+    # D tangents at once: the primal pass, the costliest part, is shared by them (out_axes None).
     found: tuple[Array, ...] = jax.vmap(along, out_axes=(None, 0, 0, None, 1))(jnp.eye(theta.size))
     return found[:3] if multipliers is None else found
 
@@ -94,6 +95,8 @@ def _try_backward(function: Callable[[Array], tuple[Array, Any]], at: Array) -> 
     try:
         return jax.grad(function, has_aux=True)(at)
     except ValueError as error:
+        # `jax.lax.while_loop` has no rule for going back: JAX says so by a ValueError alone, whose text is all there is
+        # to tell it by.
         if NOT_BACKWARD not in str(error):
             raise
         return None
@@ -115,6 +118,8 @@ def differentiate_in_states(
     model = Model(structure, arguments._replace(samples=tuple(later)))
 
     def lagrangian(nudges: Array) -> tuple[Array, Array]:
+        # D J / D nudge_r at nudge = 0 is the cost to go's derivative in x at the start of row r: psi of (6),
+        # discretized.
         path = propagation.propagate(model, tau, p, jnp.ones(()), nudges)
         J, c = path_costs.compute_path_cost(model, path, p), path_costs.compute_path_constraints(model, path, p)
         return J + multipliers @ c, path.before
@@ -168,10 +173,12 @@ def simulate_rows(
             row = opening[i] - 1 + side
             piece = jax.tree.map(lambda a, row=row: a[row], path.pieces)
             slope = propagation.switch_mode(model, i + side, partial(model.field, piece=piece), tau[i], values[row], p)
+            # The end of a row at tau_i moves with tau_i: d/dtau x(tau, tau) = x_tau + f, of which the first is wanted.
             moving = moving.at[row, :, i].add(-slope)
         return moving
 
     def see_along(t: Array, x: Array, x_d: Array) -> Array:
+        # Transition times are the first N unknowns, on which outputs depend by the state alone.
         in_x, in_p = jax.jacfwd(see, argnums=(1, 2))(t, x, p)
         return in_x @ x_d + jnp.pad(in_p, ((0, 0), (N, 0)))
 
