@@ -15,7 +15,8 @@ import scipy.signal
 import scipy.special
 
 from switchfit.arrays import FloatArray
-from switchfit.uncertainty.residuals import SERIOUS, UNLIKELY, compute_autocorrelation, correct_correlation
+from switchfit.uncertainty.chi_square import UNLIKELY_AS_NOISE
+from switchfit.uncertainty.residuals import SERIOUS_WIDENING, compute_autocorrelation, correct_correlation
 
 RUNS = 2000
 CASES = (
@@ -74,7 +75,7 @@ def _widen(z: FloatArray, d: int, *, biased: bool) -> float:
     probability = scipy.special.chdtrc(lags, n * (n + 2) * np.sum(r**2 / (n - np.arange(1, lags + 1))))
     first = float(r[0]) if biased else correct_correlation(float(r[0]), n, d)
     factor = float(np.sqrt((1 + first) / (1 - first)))
-    return factor if probability < UNLIKELY and factor > SERIOUS else 1.0
+    return factor if probability < UNLIKELY_AS_NOISE and factor > SERIOUS_WIDENING else 1.0
 
 
 def main(runs: int = RUNS) -> None:

@@ -17,7 +17,7 @@ from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
 from switchfit.engine.native.native_experiment import native_experiment
 from switchfit.engine.native.sizes import Order
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 
 COARSE = 58
 """Cells of the coarse mesh: with the two rows that the transitions add, 60 rows."""

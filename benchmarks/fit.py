@@ -17,7 +17,7 @@ import switchfit as sf
 from benchmarks import vehicle
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 
 TARGET = 10.0
 SAME_OPTIMUM = 1e-8

@@ -21,7 +21,7 @@ from benchmarks import models, problems, vehicle
 from benchmarks.fit import CostBySciPy, _tuned, slsqp
 from benchmarks.report import Report
 from benchmarks.timing import ms, turns_within
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 
 SAME_OPTIMUM, SUCCESS = 1e-8, 1e-6
 CLOSE = 1e-2

@@ -56,10 +56,10 @@ def problem(seen: str, engine: str = "auto") -> sf.Problem:
 
 def measure(runs: int, engine: str = "auto") -> dict[str, Any]:
     """Seconds a fit: `runs` refits at once, and some of them by `estimate`, one after the other."""
-    from switchfit.batch.program import Limits
-    from switchfit.batch.simulated import build_study
-    from switchfit.fit.evaluator import Evaluator
-    from switchfit.fit.solution import minimize_cost
+    from switchfit.batch.programs import Limits
+    from switchfit.batch.simulated_study import build_study
+    from switchfit.fit.minimization import minimize_cost
+    from switchfit.meshes.evaluator import Evaluator
 
     found: dict[str, Any] = {}
     for name, (seen, start) in CASES.items():

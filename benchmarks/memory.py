@@ -14,7 +14,7 @@ import numpy as np
 
 import switchfit as sf
 from switchfit.discretization.mesh import Mesh
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 
 HORIZON = 100.0
 

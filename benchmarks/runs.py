@@ -14,8 +14,8 @@ import switchfit as sf
 from benchmarks.report import Report
 from benchmarks.timing import ms
 from switchfit.engine.native.program_cache import _program_of
-from switchfit.fit import solution
-from switchfit.fit.evaluator import Evaluator
+from switchfit.fit import minimization
+from switchfit.meshes.evaluator import Evaluator
 
 RUNS = (10, 20, 40, 80, 160)
 SHARED = {"k": 2.0, "c": 0.3, "b": 0.2}
@@ -135,8 +135,8 @@ def _iteration(evaluator: Evaluator, by_blocks: bool) -> tuple[float, int]:
     seconds, iterations = [], 0
     for _ in range(3):
         began = time.perf_counter()
-        with patch.object(solution, "MANY_RUNS", 1 if by_blocks else sys.maxsize):
-            result = solution.minimize_cost(evaluator, theta, "exact", 1e-7, 200)
+        with patch.object(minimization, "MANY_RUNS", 1 if by_blocks else sys.maxsize):
+            result = minimization.minimize_cost(evaluator, theta, "exact", 1e-7, 200)
         iterations = result.iterations
         seconds.append((time.perf_counter() - began) / iterations)
     return min(seconds), iterations

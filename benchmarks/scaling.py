@@ -16,7 +16,7 @@ import switchfit as sf
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
 from switchfit.discretization.mesh import Mesh
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 
 NODES = (500, 1000, 2000, 4000, 8000)
 HORIZON = 10.0

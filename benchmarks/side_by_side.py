@@ -25,7 +25,7 @@ from benchmarks.problems import Case
 from benchmarks.report import Report
 from benchmarks.timing import ms, turns_within
 from switchfit.engine.native.program_cache import drop_programs
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 
 QUANTITIES = ("cost", "gradient", "hessian")
 ACCURACY = (1e-8, 1e-7, 1e-6)

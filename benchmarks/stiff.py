@@ -9,7 +9,7 @@ import switchfit as sf
 from benchmarks import side_by_side, stiff_runs
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 
 RATE = 1e5
 """The fast rate of the stiff mode, and 5 where no mode shall be stiff."""

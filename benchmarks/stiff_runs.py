@@ -12,7 +12,7 @@ import numpy as np
 import switchfit as sf
 from benchmarks.report import Report
 from benchmarks.timing import Timing, ms, take_turns
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 
 RUNS, SAMPLES, HORIZON, SIGMA = 19, 1421, 100.0, 0.02
 """27,000 samples in all, over 100 s each."""

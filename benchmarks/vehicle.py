@@ -9,7 +9,7 @@ import numpy as np
 
 import switchfit as sf
 from switchfit.discretization.mesh import Mesh, build_rows
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.models import skid_steer
 from switchfit.problem.functions import use_float64
 

@@ -18,7 +18,7 @@ matplotlib.use("agg")
 from matplotlib.figure import Figure
 
 from switchfit.report.panels import plot_comparison, plot_modes, plot_transitions
-from switchfit.uncertainty.residuals import find_transition_intervals
+from switchfit.uncertainty.corrected_errors import find_transition_intervals
 
 HERE = Path(__file__).parent
 EXAMPLE = HERE.parent / "examples" / "toss" / "release.py"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from switchfit.paper import PARTS
+from switchfit.paper.parts import PARTS
 
 HERE = Path(__file__).parent
 

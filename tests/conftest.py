@@ -11,12 +11,13 @@ import pytest
 from hypothesis import settings
 
 import switchfit as sf
-from switchfit.batch import program as batch_program
+from switchfit.batch import layout as batch_layout
+from switchfit.batch import programs
 from switchfit.engine.native import program_cache
 from switchfit.engine.native.llvm import compilation
 from switchfit.engine.native.program_cache import drop_programs
 from switchfit.models import heater_problem
-from switchfit.uncertainty import certificate
+from switchfit.uncertainty import derivative_check
 
 # Tracing allocates so much that the default of 700 has the collector at work for a sixth of the time of such tests.
 gc.set_threshold(400_000, 20, 10)
@@ -131,8 +132,8 @@ def fits_one_by_one():
         raise ValueError("error calling callback: none was called")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch_program, "_minimize_fits", refuse)
-        patch.setattr(batch_program, "runs_natively", lambda *given: False)  # evaluations are done one by one too
+        patch.setattr(programs, "minimize_fits", refuse)
+        patch.setattr(batch_layout, "runs_natively", lambda *given: False)  # evaluations are done one by one too
         yield
 
 
@@ -142,7 +143,7 @@ def quick_certificates(monkeypatch):
 
     For tests of what else is saved, printed and drawn of a fit, which is the same; a program takes 1 s.
     """
-    monkeypatch.setattr(certificate, "measure_closing_gap", lambda *given: (0.0, 0.0))
+    monkeypatch.setattr(derivative_check, "measure_closing_gap", lambda *given: (0.0, 0.0))
 
 
 @pytest.fixture

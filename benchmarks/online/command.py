@@ -13,8 +13,8 @@ from benchmarks import machine
 from benchmarks.online import exact, long, side_by_side
 from benchmarks.online.drives import SENSORS, Drive, build_problem, simulate
 from benchmarks.report import RESULTS, format_table
+from switchfit.online.calibration import NEVER
 from switchfit.online.estimator import THRESHOLD
-from switchfit.online.state import NEVER
 
 QUIET, QUIET_LENGTH, LEVELS = 200, 20.0, (8.0, 10.0, 12.0)
 """Drives without a change, s, and thresholds at which alarms in them are counted."""

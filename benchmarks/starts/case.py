@@ -13,7 +13,7 @@ from scipy.stats import qmc
 
 import switchfit as sf
 from benchmarks.models import Model
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 
 TOLERANCE = 1e-6
 """A cost that is above the best known by no more than this part of it is the best."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import switchfit as sf
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 
 
 @dataclass(frozen=True)

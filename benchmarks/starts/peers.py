@@ -20,9 +20,11 @@ import scipy.optimize
 import switchfit as sf
 from benchmarks.starts.case import Case, Sampled
 from benchmarks.starts.end import End
-from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, REFINEMENTS, judge_meshes, refine_meshes
-from switchfit.fit.evaluator import Evaluator
-from switchfit.uncertainty.prediction import Sensitivity, collect_sample_derivatives
+from switchfit.estimation.local_fit import REFINEMENTS
+from switchfit.meshes.evaluator import Evaluator
+from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, judge_meshes, refine_meshes
+from switchfit.uncertainty.sample_derivatives import collect_sample_derivatives
+from switchfit.uncertainty.sensitivity import Sensitivity
 
 MOST_CALLS = 300
 FTOL = 1e-12

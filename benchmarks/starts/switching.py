@@ -7,7 +7,7 @@ import numpy as np
 import switchfit as sf
 from benchmarks import models, problems
 from benchmarks.starts.case import Case, Collocated, draw_anywhere
-from switchfit.paper import algorithms
+from switchfit.paper.oscillator import LTI_TRUTH, build_oscillator
 
 FIVE_SWITCHES = np.array([0.10021709786456, 0.29739223936426, 0.43294465994443, 0.64175816832317, 0.76662528600859])
 """Optimal switches of `linear` (DOP853 at 1e-12)."""
@@ -32,5 +32,5 @@ def linear(count: int = 64) -> Case:
 
 def oscillator(count: int = 64) -> Case:
     """The paper's linear example: when its brake closes, stiffness and damping, over all bounds."""
-    problem = algorithms.build_oscillator()
-    return Case(problem, np.array(algorithms.LTI_TRUTH), draw_anywhere(problem, count, seed=2))
+    problem = build_oscillator()
+    return Case(problem, np.array(LTI_TRUTH), draw_anywhere(problem, count, seed=2))

@@ -127,7 +127,7 @@ class Along(NamedTuple):
     ell: Bends
 
 
-class Transition(NamedTuple):
+class TransitionQuantities(NamedTuple):
     """All quantities at one transition time tau_i that need only x: before (x-) and after (x+) the reset map.
 
     Attributes
@@ -211,7 +211,9 @@ def assemble(rows_tau: list[Array], DpDp_J: Array) -> Array:
 # Equations (11), (13), (16), (17), at a transition time
 
 
-def compute_tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
+def compute_tau_tau(
+    i: int, here: TransitionQuantities, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities
+) -> Array:
     """Return D_{tau_j} D_{tau_i} J for all j <= i, equations (11) and (13): (N,), zero for j > i."""
     psi, Omega, _ = adjoints
     X, xdot, f_im1, f_i, Lambda, Dell, _ = here
@@ -228,7 +230,7 @@ def compute_tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensiti
     return row
 
 
-def compute_tau_p(here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
+def compute_tau_p(here: TransitionQuantities, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities) -> Array:
     """Return D_{tau_i} D_p J, equation (16): (M,)."""
     psi, _, Omega_p = adjoints
     X_taup = here.f_im1.D1 @ minus.Dp_x - here.f_i.D1 @ plus.Dp_x + here.f_im1.Dp - here.f_i.Dp  # (17)
@@ -236,7 +238,7 @@ def compute_tau_p(here: Transition, adjoints: Adjoints, minus: Sensitivities, pl
     return jump + psi @ X_taup + here.X @ Omega_p  # (16)
 
 
-def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> Transition:
+def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> TransitionQuantities:
     """Return the vector fields, ell and the reset map on both sides of transition i (from 0), equation (8)."""
     opening = path.layout.first_row[i + 1]
     piece: Piece = pick(path.pieces, opening)
@@ -257,14 +259,14 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
     f_im1, f_i = differentiate(carry_over, *minus), differentiate(f_after, *plus)
     X = f_im1.value - f_i.value  # (8)
     Dell, R_twice = jax.grad(ell_after, argnums=1)(*plus), differentiate_twice(R, *minus)
-    return Transition(X, f_before(*minus), f_im1, f_i, differentiate(Lambda, *minus), Dell, R_twice)
+    return TransitionQuantities(X, f_before(*minus), f_im1, f_i, differentiate(Lambda, *minus), Dell, R_twice)
 
 
 # The forward sweep: equation (10) and the columns of Phi
 
 
 def integrate_sensitivities(
-    model: Model, path: Path, transitions: list[Transition], p: Array
+    model: Model, path: Path, transitions: list[TransitionQuantities], p: Array
 ) -> tuple[Sensitivities, Sensitivities]:
     """Return Phi(t, tau_j) X^j and D_p x at the start and at the end of each row: (R, n, N) and (R, n, M) arrays."""
     n, N = model.structure.n, model.structure.N
@@ -334,7 +336,7 @@ def evaluate_integrands(d: Along, adjoints: Adjoints) -> Quadratures:
 
 
 def sweep_backward(
-    model: Model, path: Path, transitions: list[Transition], Dp_x_before: Array, Dp_x_after: Array, p: Array
+    model: Model, path: Path, transitions: list[TransitionQuantities], Dp_x_before: Array, Dp_x_after: Array, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
     """Return the adjoints at t0, those at the start of each row (R, ...; at tau_i+ if it opens a segment), and (9),
     (14).
@@ -478,11 +480,11 @@ def add_sample_jumps(
 
 
 def pass_reset(
-    transitions: list[Transition], segment: Array, opens: Array, adjoints: Adjoints, Dp_x: Array
+    transitions: list[TransitionQuantities], segment: Array, opens: Array, adjoints: Adjoints, Dp_x: Array
 ) -> Adjoints:
     """Return the adjoints at tau_i- from those at tau_i+, where a row opens a segment; `Dp_x` is that at tau_i-."""
 
-    def through(here: Transition) -> Adjoints:
+    def through(here: TransitionQuantities) -> Adjoints:
         (psi, Omega, Omega_p), R = adjoints, here.R
         return Adjoints(
             psi @ R.D1,
@@ -495,7 +497,7 @@ def pass_reset(
     return adjoints
 
 
-def add_reset(here: Transition, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
+def add_reset(here: TransitionQuantities, adjoints: Adjoints, Dp_x: Array) -> Quadratures:
     """Return the contributions of the reset map's own dependence on p to (9) and (14); `Dp_x` (n, M) is at tau_i-."""
     (psi, _, Omega_p), R = adjoints, here.R
     return Quadratures(psi @ R.Dp, R.Dp.T @ Omega_p + contract(psi, R.DpDp + R.D1Dp @ Dp_x))

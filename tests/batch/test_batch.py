@@ -19,13 +19,15 @@ from support.heated_rooms import ROOM, TIMES, TRUTH, room
 from support.models import climb, decay, one_run, refused, rest, slow_guess, temperature
 from support.optimizer import minimize, solve_qp
 from support.optimizer import rows as linear
-from switchfit.batch import program, starts
-from switchfit.batch import simulated as module
+from switchfit.batch import batch, programs, simulated_study, starts
+from switchfit.batch import layout as layout_module
+from switchfit.batch.batch import Batch
 from switchfit.batch.chunks import run_chunks
-from switchfit.batch.program import CHUNK, Batch, Limits, _minimize_fits
+from switchfit.batch.layout import CHUNK
+from switchfit.batch.programs import Limits, minimize_fits
 from switchfit.estimation.local_fit import fit_locally
-from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.solution import minimize_cost
+from switchfit.fit.minimization import minimize_cost
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.models import heater_problem
 from switchfit.optimize.least_distance import nearest_feasible
 from switchfit.optimize.traced_constraints import TracedBreakpoints, TracedConstraints
@@ -33,7 +35,7 @@ from switchfit.optimize.traced_qp import nonnegative_minimum
 from switchfit.optimize.traced_sqp import minimize_traced
 from switchfit.optimize.traced_state import TracedProblem
 from switchfit.problem.functions import use_float64
-from switchfit.strategy.starts import draw_starts
+from switchfit.strategy.random_starts import draw_starts
 
 OTHER = sf.HybridSystem({"on": lambda t, x, p: 2.0 - 2.0 * p["k"] * x, "off": decay}, [0.2])
 
@@ -139,7 +141,7 @@ LIMITS = Limits(1e-7, 200)
 
 
 def work_of(problem, truth, start, noise=None, seed=3):
-    return module.build_study(problem, truth, start, noise, seed, LIMITS)[0]
+    return simulated_study.build_study(problem, truth, start, noise, seed, LIMITS)[0]
 
 
 @pytest.mark.parametrize(
@@ -171,13 +173,13 @@ def test_monte_carlo_is_the_same_as_single_fits(problem, noise):
 
 def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
     """As with a GPU: in calls of 16 fits, not of 4096, and only what JAX evaluates."""
-    monkeypatch.setattr(program, "CHUNK_IN_LOCKSTEP", 16)
+    monkeypatch.setattr(layout_module, "CHUNK_IN_LOCKSTEP", 16)
     work = work_of(room(engine="jax"), TRUTH, np.array([1.7, 1.0]))
     values = np.stack([work.draw_run(k)[0, 0] for k in range(12)])
     varying, starts = work.stack_values({(0, 0): values}), work.starts.repeat(12, axis=0)
     one = Batch(work.problem, work.meshes, varying, LIMITS).fit(starts)
-    monkeypatch.setattr(program, "has_gpu", lambda: True)
-    assert (program.choose_chunk_size(work.problem), program.choose_chunk_size(room())) == (16, 128)
+    monkeypatch.setattr(layout_module, "has_gpu", lambda: True)
+    assert (layout_module.choose_chunk_size(work.problem), layout_module.choose_chunk_size(room())) == (16, 128)
     other = Batch(work.problem, work.meshes, varying, LIMITS).fit(starts)
     natively = Batch(replace(work.problem, engine="auto"), work.meshes, varying, LIMITS).fit(starts)
     np.testing.assert_allclose(one.theta, other.theta, rtol=0, atol=1e-10)
@@ -366,10 +368,10 @@ def test_nothing_is_compiled_for_other_limits():
     """Which are obeyed all the same."""
     settings = {"theta": TRUTH, "start": [1.7, 1.0], "seed": 3}
     whole = sf.monte_carlo(room(), 4, **settings)
-    count = _minimize_fits._cache_size()
+    count = minimize_fits._cache_size()
     assert not sf.monte_carlo(room(), 4, **settings, max_iterations=1).success.any()
     rough = sf.monte_carlo(room(), 4, **settings, tolerance=1e5)  # the first gradients are larger still
-    assert _minimize_fits._cache_size() == count
+    assert minimize_fits._cache_size() == count
     assert rough.success.all()
     assert rough.iterations.sum() < whole.iterations.sum()
 
@@ -383,7 +385,7 @@ def finished(monkeypatch):
         begun.append((tuple(theta), settings[-1]))
         return minimize_cost(evaluator, theta, *settings, **more)
 
-    monkeypatch.setattr(program, "minimize_cost", listen)
+    monkeypatch.setattr(batch, "minimize_cost", listen)
     return begun
 
 
@@ -404,7 +406,7 @@ def test_another_sequence_of_the_same_length_compiles_nothing():
         run = sf.Experiment(sf.Measurements(TIMES, np.zeros(24), sigma=0.01), sequence, [2.05, 4.1], 0.0, 6.0)
         problem = sf.Problem(ROOM, run, {"k": sf.Parameter(0.8, lower=0.1, upper=5.0)}, max_transitions=3)
         assert sf.monte_carlo(problem, 8, theta=problem.initial_theta).success.any()
-        counts.append(_minimize_fits._cache_size())
+        counts.append(minimize_fits._cache_size())
     assert counts[0] == counts[1]
 
 
@@ -525,7 +527,7 @@ def test_an_error_of_the_program_itself_is_said(monkeypatch):
     def fail(*given, layout):
         raise TypeError("unhashable layout")
 
-    monkeypatch.setattr(program, "_minimize_fits", fail)
+    monkeypatch.setattr(programs, "minimize_fits", fail)
     settings = {"theta": TRUTH, "seed": 1}
     with pytest.warns(RuntimeWarning, match=r"failed \(TypeError: unhashable layout\); they are done one by one"):
         study = sf.monte_carlo(room(), 3, **settings)
@@ -582,12 +584,12 @@ def test_what_the_program_does_not_settle_is_fitted_from_its_start(monkeypatch, 
     expected = Batch(problem, meshes, {}, LIMITS).fit(starts)
 
     def leave_one(*given, layout):
-        outcome = _minimize_fits(*given, layout=layout)
+        outcome = minimize_fits(*given, layout=layout)
         theta, settled = np.array(outcome.theta), np.array(outcome.settled)
         theta[1], settled[1] = [0.0, 5.0], False
         return outcome._replace(theta=theta, settled=settled)
 
-    monkeypatch.setattr(program, "_minimize_fits", leave_one)
+    monkeypatch.setattr(programs, "minimize_fits", leave_one)
     found = Batch(problem, meshes, {}, LIMITS).fit(starts)
     assert finished == [((2.0, 0.9), 200 - expected.iterations[1])], "together they have what was allowed"
     np.testing.assert_allclose(found.theta, expected.theta, rtol=0, atol=1e-8)

@@ -11,8 +11,9 @@ import scipy.stats
 
 import switchfit as sf
 from support.models import RAMP, STILL, curve, refused
-from switchfit.batch.program import CHUNK, Limits
-from switchfit.batch.simulated import StudyOfRuns
+from switchfit.batch.layout import CHUNK
+from switchfit.batch.programs import Limits
+from switchfit.batch.resampled_data import StudyOfRuns
 
 TIMES = np.linspace(0.1, 4.0, 40)
 

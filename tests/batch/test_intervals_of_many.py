@@ -11,11 +11,13 @@ import pytest
 import switchfit as sf
 from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem
 from support.valleys import eaten, leaky
-from switchfit.batch import simulated
-from switchfit.batch.program import Limits
+from switchfit.batch import simulated_study
+from switchfit.batch.programs import Limits
 from switchfit.batch.study import Study
-from switchfit.fit.evaluator import Evaluator
-from switchfit.uncertainty.walks import Derivatives, Walks, find_ends, trace_walks
+from switchfit.meshes.evaluator import Evaluator
+from switchfit.uncertainty.profile_pieces import find_ends
+from switchfit.uncertainty.walk_tracing import trace_walks
+from switchfit.uncertainty.walks import Derivatives, Walks
 
 
 def measured(tau, seed, times=TIMES):
@@ -164,7 +166,7 @@ def test_a_kink_has_an_interval_with_jax_too():
 
 def test_what_is_found_for_a_run_does_not_depend_on_the_others_of_its_call():
     problem, truth = charged(2.0, 3, True), np.array([2.0])
-    work, _ = simulated.build_study(problem, truth, truth, None, 0, Limits(1e-7, 200))
+    work, _ = simulated_study.build_study(problem, truth, truth, None, 0, Limits(1e-7, 200))
     whole, *parts = (work(runs) for runs in (range(128), range(50), range(50, 128)))
     assert np.isfinite(whole["pieces"][:, 0, 0, 0, 0]).any()
     for name, array in whole.items():

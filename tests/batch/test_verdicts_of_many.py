@@ -9,9 +9,9 @@ import switchfit as sf
 from support.heated_rooms import ROOM, TIMES, TRUTH
 from support.heated_rooms import room as heat
 from support.models import temperature
-from switchfit.batch.fits import _count_collapsed
-from switchfit.batch.program import CHUNK
-from switchfit.uncertainty.residuals import measure_quality
+from switchfit.batch.doubts import _count_collapsed
+from switchfit.batch.layout import CHUNK
+from switchfit.uncertainty.quality import measure_quality
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 

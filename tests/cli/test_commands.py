@@ -297,13 +297,12 @@ def test_a_fit_waits_for_the_modules_that_draw(folder, monkeypatch):
 
 def test_ctrl_c_during_a_strategy_keeps_the_best(folder, tmp_path, monkeypatch):
     """Nobody asks the callback there: the first Ctrl-C must be heard all the same."""
-    from switchfit.strategy import choice
 
     def search(*given):
         signal.raise_signal(signal.SIGINT)
         raise AssertionError("not heard")
 
-    monkeypatch.setattr(choice, "find_times", search)
+    monkeypatch.setattr("switchfit.strategy.search.find_times", search)
     real = sf.estimate
     monkeypatch.setattr(sf, "estimate", lambda problem, **options: real(problem, **options, strategy="thorough"))
     run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures", code=0)

@@ -10,7 +10,7 @@ import switchfit as sf
 from support.models import decay, one_run, rest
 from support.swings import BOUNCE, DATA, GUARDS, MODES, MORE, PARAMETERS, RICH, problem, samples
 from switchfit.engine.native import program_cache
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 
 HARD = sf.HybridSystem(MODES | {"hard": lambda t, x, p: jnp.fft.fft(x).real * -p["k"]}, [0.4, 0.1])
 

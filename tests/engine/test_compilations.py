@@ -19,7 +19,7 @@ from support.models import decay as decay_at_k
 from switchfit.discretization.mesh import pad_length
 from switchfit.engine.jax.programs import call_model, derivatives, simulate_rows
 from switchfit.engine.native.program_cache import _program_of, drop_programs
-from switchfit.fit.evaluator import evaluator_of
+from switchfit.meshes.evaluator import evaluator_of
 from switchfit.problem import functions
 from switchfit.runtime import SMALL_LOOPS, compile_small_loops_whole
 

@@ -23,7 +23,7 @@ from switchfit.engine.jax import jax_engine
 from switchfit.engine.native.sizes import Order, Sizes
 from switchfit.engine.native.templates import Templates
 from switchfit.engine.run import runs_of
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.meshes.refinement import refine_mesh
 from switchfit.problem.corners.branches import find_corners
 from switchfit.problem.functions import use_float64

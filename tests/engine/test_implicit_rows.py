@@ -27,8 +27,8 @@ from switchfit.engine.native.program_cache import drop_programs
 from switchfit.engine.native.scalars.graph import Graph
 from switchfit.engine.native.sizes import Order
 from switchfit.engine.run import runs_of
-from switchfit.fit.accuracy import Follower
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
+from switchfit.meshes.follower import Follower
 from switchfit.meshes.refinement import refine_mesh
 from switchfit.problem.functions import use_float64
 

@@ -26,7 +26,7 @@ from switchfit.engine.native.llvm.module import Module
 from switchfit.engine.native.loops import xla_handler
 from switchfit.engine.native.program_cache import drop_programs
 from switchfit.engine.native.scalars.graph import Graph
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 
 # Functions as scalars
 

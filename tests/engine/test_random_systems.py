@@ -22,7 +22,7 @@ import switchfit as sf
 from support import reference
 from switchfit.discretization.stiffness import Stiffness
 from switchfit.engine.native.program_cache import drop_programs
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.refinement import refine_mesh
 
 SYSTEMS = 200

@@ -14,7 +14,7 @@ from support.stiff_modes import SQUARE, robertson, van_der_pol
 from support.stiff_modes import one_mode as stiff_mode
 from switchfit.engine.adaptive.stiffness import Look, Watch
 from switchfit.engine.run import runs_of
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.meshes.implicit_modes import ImplicitModes
 from switchfit.meshes.refinement import refine_if_unstable, refine_mesh
 from switchfit.report.problem import write_steps

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.fit.evaluator import evaluator_of
+from switchfit.meshes.evaluator import evaluator_of
 
 TIMES = np.linspace(0.1, 1.0, 5)
 GOOD, BAD = 0.5, -0.5

@@ -13,19 +13,13 @@ import pytest
 import switchfit as sf
 from support.commands import catch_settings, run
 from support.models import STILL, curve, decay, first_state, refused
-from switchfit.experiment_design import (
-    Candidates,
-    Nominal,
-    _build_criterion,
-    _describe,
-    choose_samples,
-    differentiate_criterion,
-    replace_inputs,
-    simulate_values,
-    stack_inputs,
-)
-from switchfit.fit.evaluator import Evaluator
+from switchfit.experiment_design.input_search import _describe, differentiate_criterion
+from switchfit.experiment_design.inputs import replace_inputs, stack_inputs
+from switchfit.experiment_design.nominal import Nominal, simulate_values
+from switchfit.experiment_design.samples import Candidates, choose_samples
+from switchfit.experiment_design.search import _build_criterion
 from switchfit.io.problem_file.loading import load_problem
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.models import heater_problem
 from switchfit.problem.functions import use_float64
 

@@ -14,11 +14,11 @@ import scipy.stats
 import switchfit as sf
 from support import models
 from support.models import fit_problem
-from switchfit.estimation import estimator
-from switchfit.estimation.local_fit import _drop_noise_of_times
-from switchfit.fit.accuracy import Follower
-from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.solution import minimize_cost
+from switchfit.estimation import estimate as estimate_module
+from switchfit.estimation.insignificance import drop_noise_of_times
+from switchfit.fit.minimization import minimize_cost
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.follower import Follower
 from switchfit.paper.vehicle import build_simulated_problem
 from switchfit.runtime.issue import Issue
 
@@ -130,7 +130,7 @@ def test_a_time_is_not_determined_if_the_others_gain_nothing_as_it_moves(slope, 
     problem = capacitor(voltage(TIMES) + noise(5))
     found = minimize_cost(evaluator_of(problem), problem.initial_theta, "auto", 1e-7, 200)
     hessian = np.array([[-1e-6, 0.0, slope], [0.0, 1.0, 0.0], [slope, 0.0, 1.0]])
-    dropped = _drop_noise_of_times(problem, replace(found, status=sf.Status.SADDLE, hessian=hessian))
+    dropped = drop_noise_of_times(problem, replace(found, status=sf.Status.SADDLE, hessian=hessian))
     assert dropped.status is status
     assert (status is sf.Status.SINGULAR) == (not dropped.hessian[0].any())
 
@@ -161,8 +161,8 @@ def test_badly_scaled_unknowns_take_the_same_iterates():
 
 
 def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
-    simulate = Mock(side_effect=estimator.compare)
-    monkeypatch.setattr(estimator, "compare", simulate)
+    simulate = Mock(side_effect=estimate_module.compare)
+    monkeypatch.setattr(estimate_module, "compare", simulate)
     fit = sf.estimate(capacitor(voltage(TIMES)))
     simulate.assert_not_called()
     assert fit.trajectories is fit.trajectories

@@ -16,8 +16,10 @@ from support.equal_fits import CERTIFICATE, assert_same
 from support.fits_by_hand import NOTHING, comparison_of, made, several, trajectory_of
 from support.models import RAMP
 from support.places import SAVED
-from switchfit.estimation.estimator import FORMAT, VERSION, Estimate, save_fit
-from switchfit.fit.result import Fit, Kink
+from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.saving import FIT_FORMAT, FIT_VERSION, save_fit
+from switchfit.fit.result import Fit
+from switchfit.fit.termination import Kink
 from switchfit.optimize import Status
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.json_records import find_dtype
@@ -74,7 +76,7 @@ def test_the_file_is_strict_and_readable(tmp_path):
     save_fit(made(), CERTIFICATE, tmp_path / "fit.json")
     text = (tmp_path / "fit.json").read_text(encoding="utf-8")
     content = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-    assert (content["format"], content["version"]) == (FORMAT, VERSION)
+    assert (content["format"], content["version"]) == (FIT_FORMAT, FIT_VERSION)
     assert content["fit"]["lower"] == ["-Infinity", "-Infinity", 0.05]
     assert content["fit"]["status"] == "CONVERGED"
     assert content["certificate"]["smallest_eigenvalue"] == "NaN"

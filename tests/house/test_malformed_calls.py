@@ -25,7 +25,7 @@ import pytest
 import switchfit as sf
 from support.models import charge as rise
 from support.models import decay as fall
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
@@ -412,7 +412,7 @@ def test_the_valid_calls_succeed(doors):
 def test_some_malformed_calls(doors, monkeypatch):
     monkeypatch.setattr("switchfit.batch.study.Batch.fit", take_long)
     monkeypatch.setattr(Evaluator, "constrained", take_long)
-    monkeypatch.setattr("switchfit.uncertainty.certificate.measure_derivative_gap", take_long)
+    monkeypatch.setattr("switchfit.uncertainty.derivative_check.measure_derivative_gap", take_long)
     calls = [call for call in calls_of(doors) if not call[0].startswith(STUDIES)]
     rng = np.random.default_rng(12)
     assert complaints(doors, [calls[k] for k in rng.choice(len(calls), 700, replace=False)]) == []

@@ -15,9 +15,10 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from support.problem_folder import fill_folder
-from switchfit import cli, paper
+from switchfit import cli
 from switchfit.engine.native.program_cache import drop_programs
 from switchfit.io.problem_file import tables
+from switchfit.paper import runner
 
 
 @pytest.fixture
@@ -169,6 +170,6 @@ def test_command_lines(command, words, folder, monkeypatch):
     def enough(*arguments, **options):
         raise ValueError("enough")
 
-    for module, name in ((sf, "estimate"), (sf, "check_derivatives"), (sf, "simulate"), (paper, "run")):
+    for module, name in ((sf, "estimate"), (sf, "check_derivatives"), (sf, "simulate"), (runner, "run")):
         monkeypatch.setattr(module, name, enough)
     assert outcome(command, *words) == "2"

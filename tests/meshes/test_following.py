@@ -12,9 +12,9 @@ from switchfit.discretization import row_errors, rows, steps
 from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_BEND, EXPLICIT_ERROR, STIFF, STIFF_BEND
 from switchfit.engine.native.kernels import JUMP_WEIGHT
 from switchfit.engine.native.sizes import Order
-from switchfit.fit import accuracy
-from switchfit.fit.accuracy import Follower
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.meshes import follower
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.follower import Follower
 from switchfit.meshes.refinement import refine_mesh, refine_mesh_of_run
 from switchfit.problem.functions import use_float64
 
@@ -56,7 +56,7 @@ def made(monkeypatch):
         runs.append(run.e)
         return refine_mesh_of_run(run, *at, **more)
 
-    monkeypatch.setattr(accuracy, "refine_mesh_of_run", refine)
+    monkeypatch.setattr(follower, "refine_mesh_of_run", refine)
     return runs
 
 

@@ -11,7 +11,7 @@ import scipy.integrate
 import switchfit as sf
 from benchmarks import vehicle_coverage
 from support.models import refused
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.models import bicycle, differential_drive, lugre, magic_formula, skid_steer, sliding_block
 from switchfit.models.tyre_forces import (
     ALIGNING_MOMENT,

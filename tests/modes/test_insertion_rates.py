@@ -11,10 +11,12 @@ import pytest
 import switchfit as sf
 from support.models import FISHING, LATE_RAMP, RAMP, fishing
 from support.swings import BOUNCE, DATA, GUARDS, MODES, MORE, problem, samples
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.modes.criterion import Score
 from switchfit.modes.fitter import Fitter
-from switchfit.modes.hunt import Improver, Pool, insert_modes, list_pulses
+from switchfit.modes.moves import Improver
+from switchfit.modes.pool import Pool
+from switchfit.modes.pulses import insert_modes, list_pulses
 from switchfit.modes.rates import add_all_modes, compute_rates
 from switchfit.modes.schedule import Schedule
 from switchfit.strategy.library import build_library

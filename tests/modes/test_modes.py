@@ -15,13 +15,13 @@ from support.mode_libraries import fall, pull, rise
 from support.models import first_state, one_run, refused, simulate_log
 from switchfit.engine.native.program_cache import _program_of
 from switchfit.models import heater_problem
-from switchfit.modes import result
-from switchfit.modes.conclusion import list_neighbours
+from switchfit.modes import certifier
 from switchfit.modes.criterion import Score, compute_weights
 from switchfit.modes.fitter import Fitter
+from switchfit.modes.neighbours import list_neighbours
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.strategy.library import build_library
-from switchfit.uncertainty.profiles import limit_unknowns
+from switchfit.uncertainty.profile_trace import limit_unknowns
 
 TIMES = np.linspace(0.0, 8.0, 81)
 SIGMA = 0.05
@@ -183,9 +183,9 @@ def test_a_missing_mode_is_not_explained(sigma, reason):
 
 
 def test_a_fit_that_does_not_converge_is_said_to_be_so(monkeypatch):
-    fit = result.fit_locally
+    fit = certifier.fit_locally
     begin = lambda problem, start: fit(problem, start=start + 0.01, max_iterations=0)  # noqa: E731
-    monkeypatch.setattr(result, "fit_locally", begin)
+    monkeypatch.setattr(certifier, "fit_locally", begin)
     found = sf.find_modes(make_problem(), max_switches=3)
     assert found.status is sf.ModeStatus.NOT_CONVERGED
     assert found.best.message in found.message

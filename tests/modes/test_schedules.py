@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import switchfit as sf
 from support.mode_libraries import fall, make_library, pull, rise
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.schedule import (
     Schedule,

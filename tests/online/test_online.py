@@ -12,7 +12,7 @@ from support.models import decay, one_run, simulate_log
 from support.online_drives import MODES, SIGMA, SWITCHES, TIMES, measure, simulate, track, vehicle
 from switchfit.engine.hypotheses import Hypotheses
 from switchfit.models import skid_steer
-from switchfit.online.tracker import Past, Start, forget
+from switchfit.online.window_start import Past, Start, forget
 
 
 @pytest.fixture(scope="module")
@@ -522,7 +522,7 @@ def test_a_parameter_with_a_new_value_is_joined_to_its_old_one(variance):
 
 def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
     """Maxima of 20 s of alarms at the rate exp(-(h - 5) / 2) / s: for one an hour, h = 5 + 2 log(3600)."""
-    from switchfit.online import state as calibration
+    from switchfit.online import samples
 
     rng = np.random.default_rng(0)
     drawn = iter(5 + 2 * (np.log(20) - np.log(rng.exponential(size=4000))))
@@ -532,7 +532,7 @@ def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
 
     quiet = SimpleNamespace(reset=lambda: None, update=update)
     monkeypatch.setattr(sf.OnlineEstimator, "build_like", lambda online, problem, threshold: quiet)
-    monkeypatch.setattr(calibration, "list_updates", lambda noisy: [(0.0, {})])
+    monkeypatch.setattr(samples, "list_updates", lambda noisy: [(0.0, {})])
     found = sf.calibrate(sf.OnlineEstimator(problem), 1 / 3600, runs=4000)
     assert found.threshold == pytest.approx(5 + 2 * np.log(3600), abs=0.5)  # 1.8 more without the factor
 

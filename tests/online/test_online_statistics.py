@@ -8,7 +8,7 @@ from scipy.stats import chi2
 import switchfit as sf
 from support.online_drives import MODES, SWITCHES, TIMES, measure, simulate, track, vehicle
 from switchfit.models import skid_steer
-from switchfit.online.tracker import invert
+from switchfit.online.information import invert
 
 pytestmark = pytest.mark.slow
 

@@ -10,8 +10,13 @@ from typer.testing import CliRunner
 import switchfit as sf
 from support.places import ROOT
 from switchfit.cli import app
-from switchfit.paper import PARTS, Part, algorithms, run, studies, table, tyres
-from switchfit.paper.vehicle import NAMES, TRUTH, Row, compute_vehicle, draw_vehicle, wheel_speeds
+from switchfit.paper import convergence, magic_reference, noise, oscillator, studies, trials
+from switchfit.paper.parts import PARTS, Part
+from switchfit.paper.runner import format_comparison, run
+from switchfit.paper.table_rows import TableRow
+from switchfit.paper.tyre_logs import wheel_speeds
+from switchfit.paper.vehicle import NAMES, TRUTH
+from switchfit.paper.vehicle_figure import compute_vehicle, draw_vehicle
 
 COEFFICIENTS = ("eigenvalues", "undetermined", "worst")
 """What is found of the Hessian in the 16 coefficients of the Magic Formula."""
@@ -49,7 +54,7 @@ def test_lti_example_agrees_with_matrix_exponentials_and_exact_sqp_is_the_fastes
     assert exact <= 8
     assert steepest > block > 3 * exact
     # J and DJ vanish at the truth, where D²J is positive definite: had a term of Van Loan's been lost, J would not.
-    cost, gradient, hessian = algorithms.evaluate_exactly(np.array(algorithms.LTI_TRUTH))
+    cost, gradient, hessian = oscillator.evaluate_exactly(np.array(oscillator.LTI_TRUTH))
     assert max(abs(cost), *np.abs(gradient)) < 1e-12
     assert np.linalg.eigvalsh(hessian)[0] > 0.1
 
@@ -62,9 +67,9 @@ def test_exact_sqp_is_quadratic_and_the_block_diagonal_hessian_linear():
     for fit in fits.values():
         np.testing.assert_allclose([fit["theta"][name] for name in NAMES], TRUTH, rtol=0, atol=1e-6)
     assert fits["exact"]["iterations"] <= 12
-    assert 1.7 < algorithms.order(fits["exact"]["history"]) < 2.4
+    assert 1.7 < convergence.measure_order(fits["exact"]["history"]) < 2.4
     assert fits["block-diagonal"]["iterations"] > 20 * fits["exact"]["iterations"]
-    assert 0.9 < algorithms.factor(fits["block-diagonal"]["history"]) < 1.0
+    assert 0.9 < convergence.measure_factor(fits["block-diagonal"]["history"]) < 1.0
     assert 500 < fits["none"]["iterations"] < 2000
     assert found["eigenvalues_at_start"][0] < 0 < found["descents"]
     assert fits["descent-first"]["iterations"] - found["descents"] <= 12
@@ -76,8 +81,8 @@ def test_magic_formula_reference_gives_values_like_the_paper(monkeypatch):
     """What is found of the 16 coefficients, which takes long, is that of the documentation."""
     results = json.loads((ROOT / "docs" / "paper-results.json").read_text())
     kept = {name: results["magic-formula"]["found"][name] for name in COEFFICIENTS}
-    monkeypatch.setattr(tyres, "_coefficients", lambda speeds, say: kept)
-    monkeypatch.setattr(tyres, "RAMPS", ((0.6, 3.4),))
+    monkeypatch.setattr(magic_reference, "_coefficients", lambda speeds, say: kept)
+    monkeypatch.setattr(magic_reference, "RAMPS", ((0.6, 3.4),))
     found = found_by("magic-formula")
     (slow,) = found["ramps"]
     assert abs(slow["theta"]["tau_2"] - 11.7) < 0.3  # later by the wheels' own delay
@@ -92,7 +97,7 @@ def test_magic_formula_reference_gives_values_like_the_paper(monkeypatch):
 
 @pytest.mark.slow
 def test_sixteen_coefficients_do_not_work():
-    found = tyres._coefficients(wheel_speeds(), lambda text: None)
+    found = magic_reference._coefficients(wheel_speeds(), lambda text: None)
     assert found["undetermined"] > 6
     assert len(found["eigenvalues"]) == 16
     assert found["eigenvalues"][0] < 1e-12 * found["eigenvalues"][-1]
@@ -109,7 +114,7 @@ def test_starts_end_at_the_truth_or_at_the_bound_of_mu_and_strategies_lead_away_
 
 @pytest.mark.slow
 def test_error_grows_with_noise_and_is_largest_for_mu(monkeypatch):
-    monkeypatch.setattr(studies, "QUICK_LEVELS", (0.0, 0.05, 0.25, 0.5))
+    monkeypatch.setattr(noise, "QUICK_NOISE_LEVELS", (0.0, 0.05, 0.25, 0.5))
     found = found_by("noise")
     levels = found["levels"]
     rms = np.array([level["rms"] for level in levels])
@@ -124,7 +129,7 @@ def test_error_grows_with_noise_and_is_largest_for_mu(monkeypatch):
 
 @pytest.mark.slow
 def test_trials_converge_in_fewer_than_fifteen_iterations(monkeypatch):
-    monkeypatch.setattr(tyres, "TRIALS", tyres.TRIALS[2:4])
+    monkeypatch.setattr(trials, "TRIALS", trials.TRIALS[2:4])
     found = found_by("trials")
     for trial in found["trials"]:
         fit = trial["fit"]
@@ -137,12 +142,12 @@ def test_trials_converge_in_fewer_than_fifteen_iterations(monkeypatch):
 def test_an_interrupted_run_goes_on_with_what_is_missing_and_one_part_alone_leaves_the_others(tmp_path, monkeypatch):
     def build(name, compute):
         def list_rows(found):
-            return [Row(name, "1 | 2", str(found["value"]))]
+            return [TableRow(name, "1 | 2", str(found["value"]))]
 
         return Part(f"part {name}", lambda quick, say: say("begins") or compute(), list_rows=list_rows)
 
     first, second = Mock(side_effect=[{"value": 1}, {"value": 3}]), Mock(side_effect=[KeyboardInterrupt, {"value": 2}])
-    monkeypatch.setattr("switchfit.paper.PARTS", {"lti": build("lti", first), "noise": build("noise", second)})
+    monkeypatch.setattr("switchfit.paper.parts.PARTS", {"lti": build("lti", first), "noise": build("noise", second)})
     said = []
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, quick=True, say=said.append)
@@ -151,15 +156,15 @@ def test_an_interrupted_run_goes_on_with_what_is_missing_and_one_part_alone_leav
         results = run(tmp_path, quick=only is None, only=only)
         assert [entry["found"]["value"] for entry in results.values()] == values
         assert json.loads((tmp_path / "results.json").read_text()) == results
-        assert (tmp_path / "table.md").read_text() == table(results)
+        assert (tmp_path / "table.md").read_text() == format_comparison(results)
     assert [entry["quick"] for entry in results.values()] == [False, True]
-    assert "| lti | 1 \\| 2 | 3 |" in table(results)
+    assert "| lti | 1 \\| 2 | 3 |" in format_comparison(results)
 
 
 def test_interrupted_study_is_not_taken_for_a_result(monkeypatch):
     monkeypatch.setattr(studies, "fit_locally", Mock(return_value=Mock(status=sf.Status.INTERRUPTED)))
     with pytest.raises(KeyboardInterrupt):
-        studies.compute_noise(True, lambda text: None)
+        noise.compute_noise(True, lambda text: None)
 
 
 def test_command_writes_figures_and_table_and_names_the_parts(tmp_path):

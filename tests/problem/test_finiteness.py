@@ -11,8 +11,8 @@ import pytest
 
 import switchfit as sf
 from support.models import fit_problem
-from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.solution import explain_nonfinite
+from switchfit.fit.nonfinite_functions import explain_nonfinite
+from switchfit.meshes.evaluator import evaluator_of
 from switchfit.problem.finiteness import find_undefined
 from switchfit.runtime.errors import NotIntegrableError
 

@@ -11,9 +11,9 @@ import pytest
 
 import switchfit as sf
 from support import models
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.runtime.errors import HiddenSwitchError
-from switchfit.uncertainty.certificate import identifiability
+from switchfit.uncertainty.identification import identifiability
 
 TIMES = np.linspace(0.5, 4.0, 8)
 A, B, C = 0.7, 0.2, 1.1

@@ -15,9 +15,9 @@ from support.models import one_run, refused
 from switchfit.cli.summaries import summarize_estimate
 from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.engine.native.library_places import places_in_library
-from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.solution import idle_unknowns
+from switchfit.fit.collapsed_modes import idle_unknowns
 from switchfit.io.problem_file.loading import load_problem, read_experiments
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.problem.functions import use_float64
 from switchfit.report.html.curves import collect_curves
 from switchfit.report.problem import write_experiments

@@ -14,11 +14,11 @@ import switchfit as sf
 from support.derivatives import differentiate
 from support.models import RAMP, first_state, fit_problem, refused
 from support.valleys import eaten, leaky
-from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.solution import _to_variables
+from switchfit.fit.change_of_variables import convert_to_variables
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.optimize.arrow import Arrow
 from switchfit.problem.variables import Variables
-from switchfit.strategy.starts import draw_starts
+from switchfit.strategy.random_starts import draw_starts
 
 TENTHS = np.linspace(0.1, 2.0, 20)
 TRUTH, RATES = (0.03, 4.0), (20.0, 0.3, 0.002)
@@ -83,11 +83,13 @@ def test_an_arrow_shaped_hessian_is_changed_in_the_same_way():
     problem = sf.Problem(RAMP, runs, {"v": 2.0})
     here = Evaluator(problem)(problem.initial_theta, arrow=True)
     assert isinstance(here.hessian, Arrow)
-    found = _to_variables(variables, theta, here, None)
+    found = convert_to_variables(variables, theta, here, None)
     expected = variables.derivatives_inward(theta, here.gradient, here.hessian.dense())
     np.testing.assert_allclose(found.gradient, expected[0])
     np.testing.assert_allclose(found.hessian.dense(), expected[1], rtol=1e-12)
-    assert not _to_variables(variables, np.full(3, 1e200), here, None).hessian.finite  # too far, without a warning
+    assert not convert_to_variables(
+        variables, np.full(3, 1e200), here, None
+    ).hessian.finite  # too far, without a warning
 
 
 @pytest.mark.parametrize(("guess", "t0"), [((0.03, 4.0), 0.0), ((10.0, 300.0), 0.0), ((10.0, 300.0), 7.0)])

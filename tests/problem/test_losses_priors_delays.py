@@ -13,8 +13,8 @@ import pytest
 
 import switchfit as sf
 from support.models import fit_problem, one_run
-from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.trajectory import compare
+from switchfit.fit.comparison import compare
+from switchfit.meshes.evaluator import evaluator_of
 from switchfit.problem.functions import use_float64
 from switchfit.problem.losses import LOSSES, influence, robust
 from switchfit.report.numbers import format_rounded

@@ -11,9 +11,10 @@ import pytest
 import switchfit as sf
 from support.derivatives import differentiate
 from support.models import refused
-from switchfit.batch.program import Inputs, Layout
+from switchfit.batch.layout import ProgramLayout
+from switchfit.batch.program_inputs import ProgramInputs
 from switchfit.engine.native.program_cache import _program_of
-from switchfit.fit.evaluator import evaluator_of
+from switchfit.meshes.evaluator import evaluator_of
 from switchfit.problem.functions import Call, trace_function
 from switchfit.strategy.beam import follow_order
 
@@ -200,9 +201,9 @@ def test_a_batch_of_runs_with_times_that_are_known():
     for lockstep in (False, True):
         natively = not lockstep
         structures = tuple(s.library for s in problem.structures) if natively else problem.structures
-        layout = Layout(structures, places, (), lockstep, natively)
+        layout = ProgramLayout(structures, places, (), lockstep, natively)
         with jax.enable_x64(True):
-            evaluate = partial(Inputs.of(evaluator, layout).evaluate, layout, ())
+            evaluate = partial(ProgramInputs.of(evaluator, layout).evaluate, layout, ())
             found = jax.jit(evaluate)(theta, jnp.ones(()))
         expected = evaluator(theta)
         for one, other in zip(found, (expected.cost, expected.gradient, expected.hessian), strict=True):

@@ -14,7 +14,7 @@ from support.models import refused
 from support.problem_folder import PROBLEM, ROOM
 from switchfit.io.problem_file.loading import load_problem
 from switchfit.report.problem import write_problem
-from switchfit.uncertainty import certificate
+from switchfit.uncertainty import derivative_check
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
@@ -124,7 +124,7 @@ class Said:
         self.study = sf.monte_carlo(self.problem, 5, theta=self.fit.theta)
         self.search = sf.multistart(self.problem, 2)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(certificate, "measure_closing_gap", lambda *given: (0.0, 0.0))  # most of the time
+            patch.setattr(derivative_check, "measure_closing_gap", lambda *given: (0.0, 0.0))  # most of the time
             self.fit.save(path)
         content = json.loads(path.read_text(encoding="utf-8"))
         del content["fit"]["seconds"]

@@ -9,7 +9,7 @@ import switchfit as sf
 from support.models import decay
 from switchfit.problem.comparisons import find_comparisons
 from switchfit.problem.reads import find_unread
-from switchfit.uncertainty.verdict import find_issues
+from switchfit.uncertainty.issues import find_issues
 
 TIMES = np.linspace(0.0, 3.0, 31)
 

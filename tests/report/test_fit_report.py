@@ -15,7 +15,10 @@ from matplotlib.figure import Figure
 import switchfit as sf
 from support.fits_by_hand import NOTHING, comparison_of, made, several, trajectory_of, warnings_of, write_report
 from support.places import SAVED
-from switchfit.fit.result import Fit, Kink, Step, Termination, compute_scaled_spectrum
+from switchfit.fit.result import Fit
+from switchfit.fit.scaled_hessian import compute_scaled_spectrum
+from switchfit.fit.search_record import Step
+from switchfit.fit.termination import Kink, Termination
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.report import issues, verdict

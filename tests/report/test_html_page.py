@@ -29,7 +29,7 @@ from switchfit.report.plane import find_plane
 from switchfit.report.unknowns import tabulate_unknowns
 from switchfit.runtime.presentation import format_page
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.residuals import correct_errors, correct_intervals
+from switchfit.uncertainty.corrected_errors import correct_errors, correct_intervals
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 

@@ -14,11 +14,11 @@ from benchmarks.modes.truths import three_modes
 from support.mode_libraries import make_library
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.hypotheses import Column, Hypotheses
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, collapse
 from switchfit.strategy import beam as beams
-from switchfit.strategy.beam import build_mesh, choose_grid, choose_stops, count_values
-from switchfit.strategy.library import Rules, select_lowest
+from switchfit.strategy.beam_grid import build_mesh, choose_grid, choose_stops, count_values
+from switchfit.strategy.sequences import Rules, select_lowest
 
 # A system with everything that a beam can follow
 
@@ -91,7 +91,7 @@ def follow_schedule(problem, grid):
         before = max(i - 1, 0)
         child = np.full((1, len(Column)), -1, dtype=np.int64)
         child[0, :4] = 0, before, i, i - 1
-        child[0, beams.FUNCTIONS] = track.functions[:, before, i]
+        child[0, beams.FUNCTION_COLUMNS] = track.functions[:, before, i]
         states = track.engine.advance(states, child, first, last)
     own = np.append(np.arange(len(TIMES)), track.births + np.arange(len(track.places)))
     return track, states.costs[0], states.gradients[0][own], states.matrices[0][np.ix_(own, own)]

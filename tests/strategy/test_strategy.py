@@ -13,16 +13,20 @@ from benchmarks.sharp.problems import dry, valve
 from support.models import decay, first_state, fishing, fit_problem, one_run, simulate_log
 from support.thermostats import FAR, HEATER, TIMES, TRUTH, temperatures, thermostat
 from switchfit.engine.corners.split_engine import SplitEngine
-from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Step
+from switchfit.fit.search_record import Step
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.optimize import Status
 from switchfit.runtime import work_clock
-from switchfit.strategy import beam, choice, starts
-from switchfit.strategy.beam import Proposal, Quadratic
-from switchfit.strategy.choice import is_enough
-from switchfit.strategy.hops import can_reinsert, hop_over_samples, reinsert_modes
-from switchfit.strategy.known_order import Beams, explain_no_beam, find_times
-from switchfit.strategy.starts import End, draw_starts, fit_briefly, try_starts
+from switchfit.strategy import beam, choice, many_starts, other_minima, search, stopping
+from switchfit.strategy.hops import hop_over_samples
+from switchfit.strategy.joint_beams import Beams
+from switchfit.strategy.known_order import explain_no_beam, find_times
+from switchfit.strategy.many_starts import try_starts
+from switchfit.strategy.proposal import Proposal, Quadratic
+from switchfit.strategy.random_starts import draw_starts
+from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
+from switchfit.strategy.short_fit import End, fit_briefly
+from switchfit.strategy.stopping import is_enough
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +45,7 @@ def test_by_default_the_right_answer_is_found_and_what_each_step_brought_is_told
     assert sum(step.evaluations for step in far_fit.steps) == far_fit.evaluations
     text = " ".join(str(far_fit).split())
     assert f"tried local: J = {costs[0]:.6g}" in text
-    assert f"{choice.BEAM}: J = {far_fit.cost:.6g}" in text
+    assert f"{search.BY_BEAM}: J = {far_fit.cost:.6g}" in text
 
 
 LOCAL, LOWER, SAME = Step("local", 40.0, 9, 0.1), Step("a search", 30.0, 9, 0.1), Step("a search", 40.0, 9, 0.1)
@@ -80,8 +84,8 @@ def test_an_end_that_chi_square_allows_and_residuals_refute_is_not_the_end():
     near = simulate_log(near, [160.0, 1.0, 0.05], seed=7)
     wrong = sf.estimate(near, strategy="local")
     assert abs(wrong.transition_times[0][0] - 165.8) < 0.1
-    assert choice.is_explained(near, wrong.cost)
-    assert not choice.is_confirmed(near, wrong)
+    assert stopping.is_explained(near, wrong.cost)
+    assert not stopping.is_confirmed(near, wrong)
     found = fit_problem(near, level="good")
     assert abs(found.transition_times[0][0] - 160.6) < 0.1
 
@@ -93,7 +97,10 @@ def test_a_fit_that_has_not_converged_on_coarse_meshes_is_replaced(monkeypatch, 
     real = choice.fit_locally
     monkeypatch.setattr(choice, "fit_locally", lambda *given, **settings: next(first, None) or real(*given, **settings))
     found = sf.estimate(thermostat(FAR))
-    assert [(step.strategy, np.isfinite(step.cost)) for step in found.steps] == [("local", False), (choice.BEAM, True)]
+    assert [(step.strategy, np.isfinite(step.cost)) for step in found.steps] == [
+        ("local", False),
+        (search.BY_BEAM, True),
+    ]
     assert found.cost == pytest.approx(right.cost, rel=1e-9)
 
 
@@ -103,7 +110,7 @@ def test_transition_times_need_not_be_given(right):
     assert sf.estimate(problem).cost == pytest.approx(right.cost, rel=1e-6)
     # Without a known noise it is not the residuals of the nearest minimum that decide.
     unknown = sf.estimate(thermostat(None, sigma=None))
-    assert [step.strategy for step in unknown.steps][:2] == ["local, from evenly spaced times", choice.BEAM]
+    assert [step.strategy for step in unknown.steps][:2] == ["local, from evenly spaced times", search.BY_BEAM]
     np.testing.assert_allclose(unknown.theta, right.theta, rtol=1e-4)
 
 
@@ -128,7 +135,7 @@ def test_a_run_that_begins_badly_does_not_lead_the_others_astray():
     start[problem.theta_names.index("power_1")] = 40.0
     found = sf.estimate(problem, start=start)
     assert found.cost == pytest.approx(best.cost, rel=1e-6)
-    assert [step.strategy for step in found.steps] == ["local", choice.BEAM]
+    assert [step.strategy for step in found.steps] == ["local", search.BY_BEAM]
 
 
 def test_modes_are_removed_and_put_in_elsewhere():
@@ -165,7 +172,8 @@ def test_many_starts_stop_when_nothing_new_is_found(right):
 
 def test_many_starts_end_where_nothing_but_noise_is_left(monkeypatch):
     """A mass on a spring with dry friction, from a guess that leads to another minimum: the first start is right."""
-    monkeypatch.setattr(choice, "explain_no_beam", lambda problem: "none is wanted")
+    for module in (choice, search, stopping):
+        monkeypatch.setattr(module, "explain_no_beam", lambda problem: "none is wanted")
     case = dry()
     found = sf.estimate(case.build_problem(), start=case.draw_starts(5)[4])
     assert found.steps[0].cost > 100 * found.cost
@@ -214,7 +222,7 @@ def count_calls(monkeypatch, owner, name, interrupted=None):
 
 @pytest.mark.parametrize(
     ("build", "start", "budget", "strategy"),
-    [(valve, 1, 5.0, choice.BEAM), pytest.param(dry, 4, 200.0, choice.STARTS, marks=pytest.mark.slow)],
+    [(valve, 1, 5.0, search.BY_BEAM), pytest.param(dry, 4, 200.0, search.BY_MANY_STARTS, marks=pytest.mark.slow)],
 )
 def test_a_budget_of_time_is_kept_within_the_time_of_two_fits(monkeypatch, build, start, budget, strategy):
     """Of models with corners, on a clock of evaluations: each of J takes a second."""
@@ -235,7 +243,8 @@ def test_a_budget_of_time_ends_the_search(monkeypatch):
         sf.estimate(thermostat(FAR), time_budget=0.0)
     with pytest.raises(ValueError, match="strategy must be 'local', 'auto' or 'thorough'; got 'magic'"):
         sf.estimate(thermostat(FAR), strategy="magic")
-    monkeypatch.setattr(choice, "is_doubted", lambda fit: True)
+    for module in (search, stopping):
+        monkeypatch.setattr(module, "is_doubted", lambda fit: True)
     found = [sf.estimate(thermostat(tuple(TRUTH[:5]), sigma=0.01), time_budget=budget) for budget in (None, 0.2)]
     assert [len(fit.steps) for fit in found] == [2, 3], "the beam finds nothing lower; seconds that are given are used"
 
@@ -503,8 +512,8 @@ def test_an_error_inside_a_search_is_a_step(monkeypatch):
 
     problem, _ = CASES["nothing more"]()
     alone = sf.estimate(problem, strategy="local")
-    monkeypatch.setattr(choice, "find_times", fail)
-    monkeypatch.setattr(choice, "try_starts", fail)
+    monkeypatch.setattr(search, "find_times", fail)
+    monkeypatch.setattr(search, "try_starts", fail)
     found = sf.estimate(problem)
     assert found.cost == alone.cost
     assert [step.ended for step in found.steps[1:]] == ["RuntimeError: a search went wrong"] * 2
@@ -523,7 +532,7 @@ def test_a_callback_ends_a_search_within_one_evaluation(strategy):
     found = sf.estimate(problem, strategy=strategy, callback=stop)
     assert found.cost == alone.cost
     assert len(seen) == alone.iterations + 1
-    assert choice.was_interrupted(found)
+    assert search.was_interrupted(found)
 
 
 def test_without_a_budget_searches_end_after_twenty_times_the_first_fit(monkeypatch):
@@ -531,8 +540,13 @@ def test_without_a_budget_searches_end_after_twenty_times_the_first_fit(monkeypa
     problem, _ = CASES["nothing more"]()
     clock = count_calls(monkeypatch, Evaluator, "__call__")
     monkeypatch.setattr(choice, "measure_work", lambda: clock[0])
-    monkeypatch.setattr(choice, "find_times", lambda problem, theta, is_enough: End(theta, np.inf, 0))
-    for module, name in ((choice, "is_enough"), (starts, "_is_enough"), (choice, "is_explained")):
+    monkeypatch.setattr(search, "find_times", lambda problem, theta, is_enough: End(theta, np.inf, 0))
+    for module, name in (
+        (choice, "is_enough"),
+        (search, "is_enough"),
+        (many_starts, "_is_enough"),
+        (search, "is_explained"),
+    ):
         monkeypatch.setattr(module, name, lambda *given: False)
     found = sf.estimate(problem)
     local = found.steps[0].evaluations
@@ -567,7 +581,7 @@ def test_a_minimum_on_the_other_side_of_where_the_modes_agree_is_found(friction)
     problem = simulate_log(problem, [7.0, 9.0, 4.0, 0.1], seed=10)
     near = fit_problem(problem, strategy="local", level="good")
     fit = sf.estimate(problem)
-    assert [step.strategy for step in fit.steps] == ["local", choice.OTHER]
+    assert [step.strategy for step in fit.steps] == ["local", search.BY_OTHER_MINIMUM]
     assert fit.cost < near.cost - 1.0
     assert abs(fit.theta[0] - 7.0) < 3 * fit.standard_errors[0]
     again = sf.estimate(problem, start=fit.theta)
@@ -600,9 +614,9 @@ def test_a_minimum_is_found_although_the_exact_hessian_far_away_has_none(monkeyp
     assert not sf.estimate(problem, time_budget=1e-9).steps, "no time is left to look elsewhere"
     (run,) = problem.experiments
     unknown = replace(problem, experiments=replace(run, data=replace(run.data[0], sigma=None)))
-    starts, _ = choice.find_other_minima(sf.estimate(unknown, strategy="local"))
+    starts, _ = other_minima.find_other_minima(sf.estimate(unknown, strategy="local"))
     assert starts[0][0] == pytest.approx(5.0, abs=0.1)
-    monkeypatch.setattr(choice, "find_far_minima", lambda *given: 1 / 0)
+    monkeypatch.setattr(other_minima, "find_far_minima", lambda *given: 1 / 0)
     assert sf.estimate(problem).theta[0] == near.theta[0], "the fit is not lost"
 
 
@@ -823,4 +837,9 @@ def test_a_minimum_of_a_cost_without_data_that_re_insertion_misses_is_found_by_s
     found = sf.estimate(one_run(system, costs, ("b", "c", "b", "a"), (1.0, 2.0, 3.0), 4.0))
     # SciPy's SLSQP with DOP853: 3 of 12 random starts end here, at the times 0, 1.9467 and 2.5182.
     assert found.cost == pytest.approx(1.5073964931, rel=1e-8)
-    assert [step.strategy for step in found.steps] == ["local", choice.REINSERT, choice.FEW, choice.STARTS]
+    assert [step.strategy for step in found.steps] == [
+        "local",
+        search.BY_REINSERTION,
+        search.BY_FEW_STARTS,
+        search.BY_MANY_STARTS,
+    ]

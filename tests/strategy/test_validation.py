@@ -13,8 +13,8 @@ from switchfit.cli.summaries import summarize_validation
 from switchfit.models import heater_problem
 from switchfit.problem.losses import robust
 from switchfit.report.numbers import format_rounded
-from switchfit.strategy.comparison import compute_log_norm
-from switchfit.strategy.validation import correlate
+from switchfit.strategy.input_correlation import correlate
+from switchfit.strategy.likelihood import compute_log_norm
 
 SIGMA = 0.3
 TRAIN, TEST = np.array([0.5, 1.0, 1.7, 2.2, 3.0, 3.9]), np.linspace(0.2, 4.5, 31)

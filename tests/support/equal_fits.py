@@ -4,7 +4,7 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 
-from switchfit.fit.result import Kink
+from switchfit.fit.termination import Kink
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.certificate import Certificate

@@ -6,10 +6,11 @@ from dataclasses import fields, replace
 import numpy as np
 
 import switchfit as sf
+from switchfit.fit.comparison import Comparison
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.fit.trajectory import Trajectory
 from switchfit.optimize import IterationRecord, Status
-from switchfit.uncertainty.verdict import find_issues
+from switchfit.uncertainty.issues import find_issues
 
 
 def trajectory_of(modes=("stick", "slip", "stick"), times=(0.0, 4.0, 7.0, 10.0), nodes=9) -> Trajectory:

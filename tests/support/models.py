@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.models import skid_steer
 
 # Vector fields and observations

@@ -91,9 +91,8 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             "compute_tau_tau(i, here, adjoints, minus, plus)",
             "compute_tau_tau(i, here, adjoints, minus, plus, "
             "[evaluate_transition(model, path, i, tau[j], p).f_im1.D1 for j in range(i)])",
-            "def compute_tau_tau("
-            "i: int, here: Transition, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities)",
-            "def compute_tau_tau(i, here, adjoints, minus, plus, misprinted)",
+            "i: int, here: TransitionQuantities, adjoints: Adjoints, minus: Sensitivities, plus: Sensitivities",
+            "i, here, adjoints, minus, plus, misprinted",
             "X_ij = f_im1.D1 @ minus.Phi_X[:, j]",
             "X_ij = misprinted[j] @ minus.Phi_X[:, j]",
         ),
@@ -236,11 +235,9 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
     },
     "kinks": {
-        "what follows a kink": swap("fit/result.py", "+ follow @ V @ follow.T", "+ 0.0 * follow @ V @ follow.T"),
-        "half of J in the density": swap(
-            "uncertainty/walks.py", "np.exp(-np.concatenate(", "np.exp(-0.5 * np.concatenate("
-        ),
-        "second moment": swap("fit/result.py", "(Z - g * (1.0 - g * Z) / s) / s", "(Z + g * (1.0 - g * Z) / s) / s"),
+        "what follows a kink": swap("fit", "+ follow @ V @ follow.T", "+ 0.0 * follow @ V @ follow.T"),
+        "half of J in the density": swap("uncertainty", "np.exp(-np.concatenate(", "np.exp(-0.5 * np.concatenate("),
+        "second moment": swap("fit", "(Z - g * (1.0 - g * Z) / s) / s", "(Z + g * (1.0 - g * Z) / s) / s"),
     },
     "other minima": {
         "points on the same path": swap("strategy", "if evaluator.paths == path:", "if evaluator.paths != path:"),
@@ -272,12 +269,12 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             NATIVE, "leave(score >= self._load_score", "leave(score <= self._load_score"
         ),
         "dropped penalty": swap("strategy", " + self.penalty * switches", ""),
-        "dropped limit for each sequence": swap("strategy/library.py", "PER_SEQUENCE = 3", "PER_SEQUENCE = 3000"),
+        "dropped limit for each sequence": swap("strategy", "PER_SEQUENCE = 3", "PER_SEQUENCE = 3000"),
         "sign of the shift": swap(NATIVE, 'graph.load("x", i) + (', 'graph.load("x", i) - ('),
         "scores for costs": swap("strategy", "costs = states.costs + ((g", "costs = states.scores + 0 * ((g"),
-        "sign of what other runs say": swap("strategy/known_order.py", "Q, Q @ center - g", "Q, Q @ center + g"),
+        "sign of what other runs say": swap("strategy", "Q, Q @ center - g", "Q, Q @ center + g"),
         "own parameters of other runs that do not follow": swap(
-            "strategy/beam.py",
+            "strategy",
             "solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)",
             "solved = np.zeros((len(others), len(others)))",
         ),

@@ -9,8 +9,9 @@ import scipy.signal
 import switchfit as sf
 from support import models
 from support.models import heated_room
-from switchfit.fit.evaluator import evaluator_of
-from switchfit.uncertainty.prediction import build_gauss_newton, collect_sample_derivatives, compute_sensitivity
+from switchfit.meshes.evaluator import evaluator_of
+from switchfit.uncertainty.sample_derivatives import build_gauss_newton, collect_sample_derivatives
+from switchfit.uncertainty.sensitivity import compute_sensitivity
 
 SIGMA = 0.1
 TIMES = np.linspace(0.25, 6.0, 24)

@@ -16,11 +16,14 @@ from support.fits_by_hand import comparison_of, made, trajectory_of, warnings_of
 from support.fits_by_hand import write_report as report
 from support.models import STILL, VEHICLE_TRUTH, curve, drive, one_run, positions, simulate_log
 from switchfit.engine.evaluation import Evaluation
-from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.result import disagreement, free_kinks, measure_kink_variance
+from switchfit.fit.kink_variance import free_kinks, measure_kink_variance
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.models import heater_problem, lugre
 from switchfit.optimize import Status
-from switchfit.uncertainty.certificate import LARGEST_GAP, Identifiability, analyse, certify, measure_derivative_gap
+from switchfit.uncertainty.certificate import certify
+from switchfit.uncertainty.covariance_comparison import disagreement
+from switchfit.uncertainty.derivative_check import LARGEST_GAP, measure_derivative_gap
+from switchfit.uncertainty.identification import Identifiability, analyse
 from switchfit.uncertainty.residuals import correct_correlation, diagnose_channel
 
 TIMES = np.linspace(0.25, 6.0, 24)

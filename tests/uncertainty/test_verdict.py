@@ -9,10 +9,10 @@ import pytest
 import switchfit as sf
 from benchmarks.starts.problems import build_case
 from support.models import STILL, curve, fishing, fit_problem, heated_room, linear, one_run, temperature
-from switchfit.fit.result import Step
+from switchfit.fit.search_record import Step
 from switchfit.report.shares import format_share
-from switchfit.uncertainty.residuals import compare_with_sigma
-from switchfit.uncertainty.verdict import Numbers, find_doubts
+from switchfit.uncertainty.chi_square import compare_with_sigma
+from switchfit.uncertainty.doubts import Numbers, find_doubts
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 

@@ -1,4 +1,4 @@
 """Thousands of fits of one model: simulated data, many starts, resampled data, many logs.
 
-Imports `estimation` and the rooms before it.
+Imports `strategy` and the rooms before it.
 """

@@ -13,20 +13,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.batch.fits import Fits, judge_starts
-from switchfit.batch.program import Limits, describe_failure
-from switchfit.batch.study import LongRun, Study, repeat
+from switchfit.batch.failures import describe_failure
+from switchfit.batch.fits import Fits
+from switchfit.batch.long_run import LongRun, repeat
+from switchfit.batch.programs import Limits
+from switchfit.batch.study import Study
+from switchfit.batch.study_verdict import judge_starts
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.estimate import Estimate
 from switchfit.estimation.local_fit import fit_locally
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation.arrays import as_array, as_count, as_seed
 from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.presentation import Drawn, draw_figure
-from switchfit.strategy.starts import MOST_DRAWN, draw_starts
+from switchfit.strategy.random_starts import MOST_DRAWN, draw_starts
 from switchfit.uncertainty.verdict import Verdict
 
 ENDS_TRIED = 10

@@ -34,7 +34,7 @@ def check(
         return
     loaded = files.load(problem)
     from switchfit.cli.summaries import summarize_check
-    from switchfit.fit.evaluator import evaluator_of
+    from switchfit.meshes.evaluator import evaluator_of
     from switchfit.report.certificate import write_orders
     from switchfit.report.problem import write_problem, write_steps
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from switchfit.cli.toml_writer import write_table
-from switchfit.estimation.estimator import Estimate, make_relative
+from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.provenance import make_relative
 from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.user_files import replace_files
 from switchfit.problem.experiment import Experiment

@@ -47,7 +47,7 @@ def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -
     with None it says nothing. `part` is what is brought to an end. During a search with strategies, which no callback
     can stop, the first one raises it: the search keeps its best fit.
     """
-    from switchfit.strategy.choice import is_searching
+    from switchfit.strategy.search import is_searching
 
     requested = threading.Event()
 

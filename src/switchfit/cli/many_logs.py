@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from switchfit.cli.tables import list_columns, list_unknowns, write_rows
-from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.estimate import Estimate
 from switchfit.io.logs.files import find_logs, name_files
 from switchfit.report import numbers as numbers_module
 from switchfit.report.frames import ERROR
 from switchfit.report.verdict import write_reason
 from switchfit.runtime.extras import import_library
-from switchfit.uncertainty.residuals import measure_quality
+from switchfit.uncertainty.quality import measure_quality
 
 PARQUET = (".parquet", ".pq")
 """Endings of tables that are written as Parquet; all others are CSV."""

@@ -151,7 +151,7 @@ def _run(
     Return what it said, if that is recorded, how many lines of stdin it refused, and whether it was interrupted.
     """
     from switchfit.cli.sample_lines import read_sample, summarize_now
-    from switchfit.online.state import list_updates
+    from switchfit.online.samples import list_updates
 
     recorded, refused = [], 0
     (run,) = loaded.problem.experiments

@@ -27,7 +27,8 @@ def paper(out: PaperFolder = Path("paper"), quick: Quick = False, only: Part = N
     the same command is run again.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")
-    from switchfit.paper import TABLE, run
+    from switchfit.paper.runner import TABLE_FILE as TABLE
+    from switchfit.paper.runner import run
 
     files.make_folder(out)
     try:

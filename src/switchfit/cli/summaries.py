@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 
 from switchfit.cli.tables import list_unknowns, zip_rows
-from switchfit.estimation.estimator import Estimate
-from switchfit.experiment_design import Design, DesignRecord
-from switchfit.fit.evaluator import Evaluator
+from switchfit.estimation.estimate import Estimate
+from switchfit.experiment_design.result import Design, DesignRecord
 from switchfit.fit.trajectory import Trajectory
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.modes.result import ModeSearch
 from switchfit.report import times
 from switchfit.report.verdict import write_reason, write_step
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation
-from switchfit.uncertainty.certificate import DerivativeCheck, Identifiability
+from switchfit.uncertainty.derivative_check import DerivativeCheck
+from switchfit.uncertainty.identification import Identifiability
 from switchfit.uncertainty.verdict import Verdict
 
 KEYS = {

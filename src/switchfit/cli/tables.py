@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.estimate import Estimate
 from switchfit.report.selection import SCREEN
 from switchfit.runtime.frames import describe_frame
-from switchfit.uncertainty.residuals import measure_quality
+from switchfit.uncertainty.quality import measure_quality
 
 # --- tables -----------------------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""`estimate`, and the `Estimate` that it returns, with its methods for uncertainty, prediction, plots and files.
+"""`Estimate`, the facade of a fit with its methods, and the single fit from one start that returns it.
 
 Imports `uncertainty` and the rooms before it.
 """

@@ -1,4 +1,6 @@
-"""One fit: the evaluator, which combines experiments; one run of the optimizer; its result as data.
+"""One fit: evaluator in, result out.
 
-Imports all rooms before it: `runtime`, `problem`, `discretization`, `engine`, `paper_adjoint`, `optimize`.
+`minimization` is one run of the optimizer, with `change_of_variables`, `collapsed_modes` and `hidden_switches`;
+`termination` says how it ended, and `result` has its numbers. `trajectory` and `comparison` show it beside the data.
+Imports `meshes` and the rooms before it.
 """

@@ -1,28 +1,19 @@
-"""Trajectories for people: the forward pass at any theta, as NumPy arrays."""
+"""Trajectories for people: states over time at any theta, as NumPy arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.engine.choice import engine_of
-from switchfit.engine.run import runs_of
 from switchfit.engine.simulation import Simulation
-from switchfit.fit.evaluator import Evaluator
-from switchfit.meshes.refinement import refine_mesh_of_run
-from switchfit.problem.experiment import Experiment, count_times, drop_jumps, show_time
+from switchfit.problem.experiment import drop_jumps
 from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem
-from switchfit.problem.reference_signals import ReferenceSignal
-from switchfit.problem.validation.arrays import as_array, as_index
 from switchfit.problem.validation.messages import unit_suffix
-from switchfit.problem.validation.objects import as_instance, set_fields
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import format_line, join_first
 
@@ -105,215 +96,6 @@ class Trajectory(Tabular):
         return self.times[np.setdiff1d(self.pieces, self.segments)]
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Measured and fitted values, for one of the data of one experiment.
-
-    Attributes
-    ----------
-    kind : "measurements" or "reference"
-    names : tuple of str, one per channel
-    times, measured, fitted : (K,), (K, q), (K, q)
-        At the sample times; for a reference signal at the nodes of the mesh. NaN where a sample is missing.
-    sigma : (K, q) or None where unknown
-    curve_times, curve : (L,), (L, q)
-        The fitted output at all nodes, for plots.
-    downweighted : (K, q) of bool, or None
-        Which residuals a robust loss treats as outliers: those larger than its `loss_scale`; None without such a loss.
-    weights : (q,) or None
-        Weights of the channels of a reference signal, the diagonal of its weight matrix; None for measurements.
-    units : tuple of str
-        Unit of each channel: as given with the data, or else that of the state of the same name; "" if unknown.
-
-    See Also
-    --------
-    Estimate.comparisons, Trajectory
-
-    Examples
-    --------
-    >>> fit = sf.estimate(heater_problem())
-
-    >>> comparison = fit.comparisons[0][0]
-    >>> comparison.names, comparison.residuals.shape
-    (('thermometer',), (24, 1))
-    >>> comparison.rmse.round(2)
-    array([0.14])
-    """
-
-    kind: str
-    names: tuple[str, ...]
-    times: FloatArray
-    measured: FloatArray
-    fitted: FloatArray
-    sigma: FloatArray | None
-    curve_times: FloatArray
-    curve: FloatArray
-    downweighted: NDArray[np.bool_] | None = None
-    weights: FloatArray | None = None
-    units: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        set_fields(self, units=self.units or ("",) * len(self.names))
-
-    def __repr__(self) -> str:
-        return format_line(self, self.kind, join_first(self.names), f"{len(self.times)} times")
-
-    @property
-    def residuals(self) -> FloatArray:
-        """Measured minus fitted: (K, q)."""
-        return self.measured - self.fitted
-
-    @property
-    def rmse(self) -> FloatArray:
-        """Root mean square of the residuals of each channel: (q,); NaN without samples."""
-        known = np.isfinite(self.measured)
-        squares = np.where(known, self.residuals, 0.0) ** 2
-        return np.sqrt(squares.sum(0) / np.where(known.any(0), known.sum(0), np.nan))
-
-
-def find_delay(comparison: Comparison, trajectory: Trajectory) -> float:
-    """Return by how much the samples of a comparison are late: they see the state of an earlier time.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    trajectory : Trajectory
-        Of its experiment.
-    """
-    return float(comparison.curve_times[0] - trajectory.times[0])
-
-
-def simulate(
-    problem: Problem,
-    theta: ArrayLike | None = None,
-    *,
-    times: ArrayLike | Literal["samples"] | None = None,
-    experiment: int = 0,
-) -> Trajectory:
-    """Integrate the model to the problem's tolerances.
-
-    Parameters
-    ----------
-    problem : Problem
-    theta : (d,) array_like, optional
-        In the order of ``problem.theta_names``; the initial guess if left out.
-    times : (K,) array_like or "samples", optional
-        Times that increase, inside [t0, tf], at which states are returned, as numbers, or as dates where the times of
-        the experiment are dates; at a transition it is the state just before it. "samples": the times of the
-        Measurements. All nodes of the mesh if left out, each transition twice. The steps that the tolerances need are
-        taken whatever these times are.
-    experiment : int, optional
-        Index of the experiment, from 0.
-
-    Returns
-    -------
-    Trajectory
-
-    Raises
-    ------
-    ValueError
-        For a theta of the wrong shape or order, times outside [t0, tf] or that do not increase, an experiment that does
-        not exist, or a trajectory that cannot be integrated.
-    TypeError
-        If an argument is of the wrong type.
-
-    See Also
-    --------
-    Trajectory, predict, evaluate
-
-    Examples
-    --------
-    >>> problem = heater_problem()
-
-    >>> path = sf.simulate(problem, [2.5, 0.4])
-    >>> round(float(path.states.max()), 1)
-    15.8
-    >>> sf.simulate(problem, [2.5, 0.4], times=[0.0, 2.0, 4.0, 6.0]).states[:, 0].round(1)
-    array([ 0. , 13.8,  8.7,  3.9])
-    """
-    as_instance(problem, "problem", Problem, "an sf.Problem")
-    experiment = as_index(experiment, "experiment", len(problem.experiments))
-    checked = problem.check_theta(theta)
-    asked = None if times is None else _check_times(problem, experiment, checked, times)
-    run = runs_of(problem)[experiment]
-    mesh = refine_mesh_of_run(run, checked)
-    mesh = mesh if asked is None else mesh.insert(asked)
-    simulation = engine_of(run, run.build_arguments(mesh), mesh).simulate(*run.vectors(checked), tangents=False)
-    found = _build_trajectory(problem, experiment, simulation)
-    if asked is None:
-        return found
-    # The first of two nodes at one time; a free tf that rounding has put before the last time is the last node.
-    k = np.minimum(np.searchsorted(found.times, asked), len(found.times) - 1)
-    segments = np.searchsorted(k, found.segments)
-    return replace(found, times=found.times[k], states=found.states[k], modes=found.modes[k], segments=segments)
-
-
-def read_times(experiment: Experiment, times: ArrayLike) -> FloatArray:
-    """Return times that are asked for, numbers or dates, as numbers: (K,).
-
-    Parameters
-    ----------
-    experiment : Experiment
-    times : (K,) array_like
-
-    Raises
-    ------
-    ValueError
-        If they are not finite numbers of shape (K,), or none.
-    """
-    asked = np.atleast_1d(as_array(count_times(experiment, times), "times"))
-    if asked.ndim != 1 or asked.size == 0 or not np.isfinite(asked).all():
-        raise ValueError(f"times must be finite numbers of shape (K,); got shape {asked.shape}.")
-    return asked
-
-
-def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike | Literal["samples"]) -> FloatArray:
-    """Return the times at which a simulation is asked for, (K,)."""
-    experiment = problem.experiments[e]
-    t0, tf = problem.ends_of_modes(theta)[e][[0, -1]].tolist()
-    if isinstance(times, str) and times == "samples":
-        found = np.unique(np.concatenate([np.zeros(0), *(item.times for item in experiment.measurements)]))
-        inside = found[(t0 <= found) & (found <= tf)]
-        if not len(inside):
-            raise ValueError(f"times='samples' needs Measurements, and experiment {e} has none; give times.")
-        return inside
-    asked = read_times(experiment, times)
-    wrong = np.append(False, np.diff(asked) <= 0) | (asked < t0) | (asked > tf)
-    if wrong.any():
-        unit = unit_suffix(experiment.time_unit) if experiment.origin is None else ""
-        ends = f"[{show_time(experiment, t0)}, {show_time(experiment, tf)}]{unit}"
-        first = show_time(experiment, asked[wrong][0])
-        raise ValueError(f"times must increase strictly inside [t0, tf] = {ends}; got {first}.")
-    return asked
-
-
-def compare(
-    evaluator: Evaluator, theta: FloatArray
-) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
-    """Return the trajectories and comparisons of all experiments at theta (d,), on the meshes of an evaluator."""
-    problem, simulations = evaluator.problem, evaluator.simulate(theta)
-    trajectories = tuple(_build_trajectory(problem, e, simulation) for e, simulation in enumerate(simulations))
-    pairs = enumerate(zip(simulations, trajectories, strict=True))
-    return trajectories, tuple(tuple(_list_comparisons(problem, e, theta, *pair)) for e, pair in pairs)
-
-
-def replace_values(problem: Problem, values: Mapping[tuple[int, int], FloatArray]) -> Problem:
-    """Return the problem with other values of some of its data; missing ones stay missing.
-
-    Parameters
-    ----------
-    problem : Problem
-    values : mapping of (int, int) to (K, q) array
-        By the experiment, and the place of the `Measurements` among its data.
-    """
-    data = [list(run.data) for run in problem.experiments]
-    for (e, k), own in values.items():
-        item = data[e][k]
-        data[e][k] = replace(item, values=np.where(np.isnan(item.values), np.nan, own))
-    runs = [replace(run, data=items) for run, items in zip(problem.experiments, data, strict=True)]
-    return replace(problem, experiments=runs)
-
-
 def select_visible(simulation: Simulation, before: FloatArray, after: FloatArray) -> FloatArray:
     """Select the entries of a trajectory from the values at the starts and ends of all rows.
 
@@ -325,7 +107,8 @@ def select_visible(simulation: Simulation, before: FloatArray, after: FloatArray
     return np.concatenate(parts)
 
 
-def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
+def build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Trajectory:
+    """Return the trajectory of experiment e from its rows, as its user sees it: without the jumps' own segments."""
     structure, system = problem.structures[e], problem.system
     moving = simulation.end > simulation.start
     counts = [1 + int(moving[rows].sum()) for rows in simulation.segments]
@@ -345,39 +128,3 @@ def _build_trajectory(problem: Problem, e: int, simulation: Simulation) -> Traje
         problem.experiments[e].time_unit,
         problem.experiments[e].origin,
     )
-
-
-def _list_comparisons(
-    problem: Problem, e: int, theta: FloatArray, simulation: Simulation, trajectory: Trajectory
-) -> Iterator[Comparison]:
-    """Compare measured with fitted for each reference signal and each Measurements."""
-    run, times = problem.experiments[e], trajectory.times
-    curves = select_visible(simulation, simulation.y_before, simulation.y_after)
-    known = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
-    first = measured = 0
-    for item in (*run.references, *run.measurements):
-        q = item.signal.channels if isinstance(item, ReferenceSignal) else item.values.shape[1]
-        channels = slice(first, first + q)
-        first += q
-        curve = curves[:, channels]
-        default = trajectory.state_names if item.observe is None else tuple(f"y{k + 1}" for k in range(q))
-        label = tuple(item.names or default)
-        units = tuple(item.units or ()) or tuple(known.get(name, "") for name in label)
-        if isinstance(item, ReferenceSignal):
-            weights = np.diag(item.weights).copy()
-            yield Comparison(
-                "reference", label, times, item.signal(times), curve, None, times, curve, None, weights, units
-            )
-        else:
-            named = problem.name_parameters(theta, e)
-            fitted = simulation.seen[measured][: len(item.times)]
-            measured += 1
-            delay = float(named[item.delay]) if isinstance(item.delay, str) else item.delay
-            sigma = item.noise(named)
-            beyond = None
-            if item.loss != "linear" and sigma is not None:
-                beyond = np.abs(np.nan_to_num(item.values - fitted)) > item.loss_scale * sigma
-            moments = times + delay  # time stamps of the sensor
-            yield Comparison(
-                "measurements", label, item.times, item.values, fitted, sigma, moments, curve, beyond, None, units
-            )

@@ -1,4 +1,6 @@
-"""Meshes: which cells an experiment needs, and which modes take implicit steps on them.
+"""Meshes: making, following, halving and judging them; a problem on its meshes is an `evaluator`.
 
-Imports `runtime`, `problem`, `discretization` and `engine`, whose adaptive solve it calls.
+`refinement` makes the mesh of an experiment by adaptive solves, with the `implicit_modes` that these show; a `follower`
+makes it anew as theta moves; `integration_error` says whether it is fine enough. Imports `runtime`, `problem`,
+`discretization`, `engine`, `paper_adjoint`, and of `optimize` the shapes of matrices.
 """

@@ -15,10 +15,6 @@ correlated values count as the w n independent ones that they are worth, and whe
 the dispersion ``c = 2 J / (n - k)`` of the most flexible fit (quasi-likelihood; Burnham and Anderson [2]_, section
 2.5): ``w n log(2 J / n)`` or ``w 2 J / c`` for the misfit, and log(w n) for log n.
 
-Whether the residuals of an estimate are noise, as the criteria take them for.
-
-Whether it is the noise and not the modes that a search cannot explain: outliers, or a wrong sigma.
-
 References
 ----------
 .. [1] N. R. Zhang, D. O. Siegmund, A modified Bayes information criterion with applications to the analysis of
@@ -29,41 +25,20 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimator import Estimate
-from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.runtime import special
-from switchfit.uncertainty.residuals import explain_all
-from switchfit.uncertainty.verdict import NEARLY_ALL
 
 CriterionName = Literal["bic", "mbic", "aicc", "cost"]
 CRITERIA: tuple[CriterionName, ...] = ("bic", "mbic", "aicc", "cost")
 
 INFORMATION: tuple[CriterionName, ...] = ("bic", "mbic", "aicc")
 """Criteria that need a likelihood, and nothing but J."""
-
-UNEXPLAINED = 1e-6
-"""Probability of chi-square below which the data are not explained."""
-
-CORRELATED = 1e-9
-"""The same of correlated residuals, by Ljung and Box's statistic, whose tail is heavier than chi-square's: of 200,000
-series of 150 random numbers 2e-4 had a probability below 1e-6 at 20 lags."""
-
-WITHIN_NOISE = 0.1
-"""Root mean square of residuals, in units of sigma, below which it does not matter how they are correlated: data
-without noise leave errors of integration."""
-
-FAR = 5.0
-"""Robust standard deviations beyond which a residual is an outlier: of normal noise, one in two million is."""
-
-MEDIAN = 1.4826
-"""Standard deviation of normal noise, in units of the median of its absolute values."""
 
 
 @dataclass(frozen=True)
@@ -184,88 +159,3 @@ def compute_weights(criteria: Sequence[float] | FloatArray) -> FloatArray:
         return np.full(len(given), np.nan)
     weights = np.exp(-0.5 * (given - given.min()))
     return np.asarray(weights / weights.sum())
-
-
-def is_far_from_noise(estimate: Estimate, score: Score) -> bool:
-    """Return whether residuals are too correlated to be noise.
-
-    Where sigma is unknown, not if nearly all of the variance is explained: real logs often have such residuals with
-    the right modes.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    score : Score
-    """
-    if not is_correlated(estimate, score, CORRELATED):
-        return False
-    return score.sigma_known is True or explain_all(estimate.comparisons) < NEARLY_ALL
-
-
-def is_correlated(estimate: Estimate, score: Score, level: float) -> bool:
-    """Return whether residuals that matter are too correlated for noise, by a probability below `level`.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    score : Score
-    level : float
-    """
-    if score.has_chi_square and 2 * estimate.cost < WITHIN_NOISE**2 * score.values:
-        return False
-    return measure_whiteness(estimate) < level
-
-
-def measure_worth(estimate: Estimate) -> float:
-    """Return how many independent residuals each is worth in the most correlated channel; 1 if none is correlated.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    """
-    channels = estimate.residuals.channels
-    found = [c.effective / len(c.values) for c in channels if c.whiteness * len(channels) < UNEXPLAINED]
-    return min(found, default=1.0)
-
-
-def measure_whiteness(estimate: Estimate) -> float:
-    """Return the probability of residuals so correlated in the worst channel, times the number of channels.
-
-    1 if no channel has enough residuals for the test.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    """
-    found = [channel.whiteness for channel in estimate.residuals.channels if np.isfinite(channel.whiteness)]
-    return min(1.0, min(found) * len(found)) if found else 1.0
-
-
-def count_far(estimate: Estimate) -> int:
-    """Return the number of outliers of a fit, in all channels."""
-    sizes = [np.abs(channel.values) for channel in estimate.residuals.channels]
-    return sum(int(np.sum(size > FAR * MEDIAN * np.median(size))) for size in sizes)
-
-
-def assume(problem: Problem, fault: str, estimate: Estimate) -> Problem:
-    """Return the problem with a robust loss in place of squares, or with sigma as large as the residuals of a fit.
-
-    Parameters
-    ----------
-    problem : Problem
-    fault : {"outliers", "sigma"}
-    estimate : Estimate
-        Of the same data.
-    """
-    runs = []
-    for e, run in enumerate(problem.experiments):
-        sizes = iter([channel.rms for channel in estimate.residuals.channels if channel.experiment == e])
-        data = []
-        for item in run.data:
-            if isinstance(item, Measurements):
-                factors = [next(sizes, 1.0) for _ in range(item.values.shape[1])]
-                change = {"loss": "huber"} if fault == "outliers" else {"sigma": np.asarray(item.sigma) * factors}
-                item = replace(item, **change)
-            data.append(item)
-        runs.append(replace(run, data=data))
-    return replace(problem, experiments=runs)

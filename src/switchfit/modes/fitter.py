@@ -3,23 +3,15 @@
 A sequence takes a problem of its own, whose functions are traced and whose program is compiled already; parameters that
 act in none of its modes are held where they are.
 
-Which parameters and initial states act in mode sequences: those that functions of the sequences read.
-
-The problem of a search: with the modes of its library alone, and room for the largest number of switches.
-
-Evaluators of mode sequences: on meshes, data and machine code that all sequences share.
-
-Arguments and experiments of machine code take longer to build than the problem of a sequence, and do not depend on it.
-
-The cost of any schedule, in the microseconds that its simulation takes: a problem for each sequence takes a millisecond
-to build, so that a scan over hundreds of schedules changes the sequence inside one experiment of machine code instead.
+The cost of any schedule takes the microseconds of its simulation: a problem for each sequence takes a millisecond to
+build, so that a scan over hundreds of schedules changes the sequence inside one experiment of machine code instead.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property
 from itertools import pairwise
 from typing import Any
@@ -28,172 +20,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.corners.branches import has_corners
-from switchfit.engine.jax.jax_engine import JaxEngine
 from switchfit.engine.native.library_places import places_in_library
-from switchfit.engine.native.native_engine import NativeEngine
 from switchfit.engine.native.native_experiment import FailedCheckError, NativeExperiment, native_experiment
 from switchfit.engine.native.sizes import Order
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.refinement import refine_mesh_of_many
+from switchfit.modes.fitted import Fitted
+from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
+from switchfit.modes.shared_engine import ExperimentsByOrder, SharedEngine
 from switchfit.optimize import LinearConstraints, lapack
-from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
-from switchfit.problem.reads import find_targets
+from switchfit.problem.reads import find_read
 from switchfit.problem.structure import Structure
-from switchfit.strategy.library import Library, trace_transition
-from switchfit.strategy.starts import fit_briefly
+from switchfit.strategy.library import Library
+from switchfit.strategy.library_structure import trace_transition
+from switchfit.strategy.short_fit import fit_briefly
 
-SEARCH_RTOL = 1e-6
-"""Integration tolerance of the search: J is right to a millionth, and a certified estimate follows on its own mesh."""
-
-Experiments = dict[Order, NativeExperiment | None]
-
-COLLAPSED = 1e-6
+COLLAPSED_BELOW = 1e-6
 """Duration, as a part of the horizon, below which a mode is left out."""
 
 TOURS = 6
 """Sequences at which the meshes are refined, so that each mode is met in all parts of the horizon."""
-
-
-def find_read(problem: Problem, structures: Iterable[Structure], *, library: bool) -> NDArray[np.bool_]:
-    """Return what the functions of a problem read, and the initial states, in the order of theta after the times: (M,).
-
-    Parameters
-    ----------
-    problem : Problem
-    structures : iterable of Structure, one for each experiment
-    library : bool
-        Whether all functions of their libraries count, or those of their sequences alone.
-    """
-    unknowns, read = problem.unknowns, find_targets(problem, structures, library=library)
-    found = np.zeros(len(unknowns.names), dtype=bool)
-    for name, span in unknowns.parameters.items():
-        found[[span.start + i for i in read.get(name, ())]] = True
-    for states in unknowns.initial_states:
-        found[states[states >= 0]] = True
-    return found[int(unknowns.is_time.sum()) :]
-
-
-def build_library_problem(problem: Problem, library: Library) -> Problem:
-    """Return the problem with the modes of a library alone, and room for its largest number of switches.
-
-    Its experiments have any sequence of the library, with free times.
-    """
-    system = problem.system
-    if set(library.modes) != set(system.modes):
-        kept = {name: system.modes[name] for name in library.modes}
-
-        def inside(functions: Mapping[tuple[str, str], Any]) -> dict[tuple[str, str], Any]:
-            return {pair: function for pair, function in functions.items() if set(pair) <= set(kept)}
-
-        system = replace(system, modes=kept, reset_maps=inside(system.reset_maps), guards=inside(system.guards))
-    runs = []
-    for run in problem.experiments:
-        schedule = _choose_schedule(run, library)
-        runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(schedule.times)))
-    jumps = max(len(run.jump_times) for run in runs)
-    most = max(library.max_switches, 1) + jumps
-    changes: dict[str, Any] = {"system": system, "experiments": runs, "min_duration": dict(library.durations)}
-    return replace(problem, **changes, max_transitions=most, rtol=max(problem.rtol, SEARCH_RTOL))
-
-
-def _choose_schedule(run: Experiment, library: Library) -> Schedule:
-    """Return a schedule of the library, with a switch if there is one: there is then something to estimate."""
-    given = tuple(run.mode_sequence)
-    sequences = [given] if len(given) > 1 and library.admits(given) else []
-    for switches in sorted(library.possible_switches, key=lambda k: (k == 0, k)):
-        sequences.append(next(library.list_sequences(switches)))
-    for sequence in sequences:
-        schedule = space_evenly(sequence, run.t0, run.end, library)
-        if schedule is not None:
-            return keep_off(schedule, run.jump_times)
-    raise ValueError(
-        f"min_duration leaves no room for any sequence in a horizon of {run.end - run.t0:g}: lower it, or change "
-        "first, last or successions."
-    )
-
-
-class SharedEngine(NativeEngine):
-    """Evaluates one sequence of a library in an experiment that other sequences use too.
-
-    Parameters
-    ----------
-    structure : Structure
-        Of the sequence, without jumps.
-    arguments : Arguments
-    mesh : Mesh
-    experiments : dict of Order to NativeExperiment
-        That all of them share; filled as needed.
-    """
-
-    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, experiments: Experiments) -> None:
-        super().__init__(structure, arguments, mesh, JaxEngine(structure, arguments, mesh))
-        self._experiments = experiments
-
-    def at(self, order: Order) -> NativeExperiment | None:
-        """Return the experiment with derivatives of an order, set to this sequence."""
-        found = super().at(order)
-        if found is not None and found.structure is not self._structure:
-            found.assign_sequence(self._structure, places_in_library(self._structure))
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A schedule that was fitted.
-
-    Attributes
-    ----------
-    schedules : tuple of Schedule, one for each experiment
-    parameters : (M,)
-        Free parameters and initial states, in the order of theta.
-    acting : (M,) bool
-        Those that act in the modes of the sequences; the others were held.
-    cost : float
-        J; infinite if the fit failed.
-    guarded : int
-        Transitions that have a guard.
-    """
-
-    schedules: tuple[Schedule, ...]
-    parameters: FloatArray
-    acting: NDArray[np.bool_]
-    cost: float
-    guarded: int = 0
-
-    @property
-    def sequences(self) -> tuple[tuple[str, ...], ...]:
-        """The mode sequence of each experiment."""
-        return tuple(schedule.sequence for schedule in self.schedules)
-
-    @property
-    def switches(self) -> int:
-        """Number of transitions of all experiments."""
-        return sum(schedule.switches for schedule in self.schedules)
-
-    @property
-    def free_switches(self) -> int:
-        """Number of transitions whose times are unknowns: the time of one with a guard follows."""
-        return self.switches - self.guarded
-
-    @property
-    def failed(self) -> bool:
-        """Whether the model could not be evaluated, or a guard or terminal constraint is not met."""
-        return not np.isfinite(self.cost)
-
-    @property
-    def has_unknowns(self) -> bool:
-        """Whether there is anything to estimate."""
-        return self.switches > 0 or bool(self.acting.any())
-
-    @property
-    def theta(self) -> FloatArray:
-        """All times, then the parameters: (d,)."""
-        return np.concatenate([*(schedule.times for schedule in self.schedules), self.parameters])
 
 
 class Fitter:
@@ -221,7 +71,7 @@ class Fitter:
         self.start = self.problem.initial_theta[self.first :]
         self.fits = self.evaluations = 0
         self._evaluators: dict[Any, Evaluator] = {}
-        self._experiments: list[Experiments] = [{} for _ in self.runs]
+        self._experiments: list[ExperimentsByOrder] = [{} for _ in self.runs]
         self._results: dict[Any, Fitted] = {}
         self._trace = cache(lambda e, pair: trace_transition(self.problem, self.problem.experiments[e], pair))
         self._build_structure = cache(self._place_functions)
@@ -470,7 +320,7 @@ class Fitter:
 
     def collapse(self, fitted: Fitted) -> tuple[Schedule, ...] | None:
         """Return the schedules of a fit without the modes that have collapsed; None if none has."""
-        shorter = tuple(collapse(s, self.library, COLLAPSED * (s.tf - s.t0)) for s in fitted.schedules)
+        shorter = tuple(collapse(s, self.library, COLLAPSED_BELOW * (s.tf - s.t0)) for s in fitted.schedules)
         pairs = zip(shorter, fitted.schedules, strict=True)
         return None if all(a.sequence == b.sequence for a, b in pairs) else shorter
 

@@ -28,8 +28,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.engine.simulation import Costates
-from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.trajectory import Trajectory, compare
+from switchfit.fit.comparison import compare
+from switchfit.fit.trajectory import Trajectory
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation.arrays import as_count

@@ -1,14 +1,8 @@
-"""The result of a search for the mode sequence.
-
-How a search for the mode sequence ended.
-
-The problem of a mode sequence, and its certified estimate.
-"""
+"""The result of a search for the mode sequence."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from enum import Enum
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,11 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.batch.fits import describe_best, load_best
-from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.local_fit import fit_locally
-from switchfit.modes.fitter import Fitted, build_library_problem
-from switchfit.modes.schedule import Schedule, keep_off, spread
+from switchfit.batch.fits_archive import describe_best, load_best
+from switchfit.estimation.estimate import Estimate
+from switchfit.modes.certifier import Certifier
+from switchfit.modes.fitted import Fitted
+from switchfit.modes.library_problem import build_library_problem
+from switchfit.modes.schedule import Schedule
+from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation.arrays import as_array, as_index
@@ -29,214 +25,11 @@ from switchfit.problem.validation.messages import join_names
 from switchfit.problem.validation.objects import as_instance, as_path
 from switchfit.runtime.json_documents import read_document, write_document
 from switchfit.runtime.json_records import from_json, to_json
-from switchfit.runtime.presentation import Displayed, Printed, draw_figure, format_line
-from switchfit.strategy.known_order import fix_unknowns
+from switchfit.runtime.presentation import Displayed, draw_figure, format_line
 from switchfit.strategy.library import Library
 
-FORMAT = "switchfit modes"
-VERSION = 5
-
-
-class ModeStatus(Enum):
-    """How a search for the mode sequence ended, and what that means.
-
-    See Also
-    --------
-    find_modes, ModeSearch
-
-    Examples
-    --------
-    >>> sf.ModeStatus.FOUND.successful
-    True
-    """
-
-    FOUND = "One mode sequence explains the data; no other is within 2 of it by mBIC, and all others have less weight."
-    AMBIGUOUS = "Another mode sequence is about as good."
-    AT_LIMIT = "The best sequence has as many switches as were allowed."
-    NOT_EXPLAINED = "No sequence explains the data."
-    NOT_CONVERGED = "The fit of the best sequence did not converge."
-    UNIDENTIFIED = "A parameter acts in no mode of the library: it is held at its guess."
-    INTERRUPTED = "The callback, or Ctrl-C, stopped the search; the result is the best so far."
-    NO_SUCCESSION = "first, last and successions admit no sequence with so few switches."
-
-    @property
-    def successful(self) -> bool:
-        """Whether the sequence may be relied on."""
-        return self in (ModeStatus.FOUND, ModeStatus.UNIDENTIFIED)
-
-
-@dataclass(frozen=True)
-class ModeEnding(Printed):
-    """How a search ended, as data; print it for a sentence with the remedy.
-
-    Attributes
-    ----------
-    status : ModeStatus
-    sequences : tuple of tuple of str
-        Of the best, one for each experiment; empty if there is none.
-    other : tuple of tuple of str
-        Of the sequence that is about as good.
-    difference : float
-        mBIC of the other less that of the best, or the criterion if that is no information criterion.
-    criterion : str
-        By which the number of switches was chosen.
-    traceless : bool
-        Whether both have the same J with the same parameters: what is measured cannot tell them apart.
-    prefers_other : str
-        "mbic" if the other is better by it; "as it stands" if it is better by the criterion without a discount for
-        residuals that are not noise; empty if neither.
-    probability : float
-        Of so large a chi-square, or of so correlated residuals, if the model is right.
-    reason : {"chi-square", "correlated residuals", "sigma", ""}
-        Why the data are not explained; "sigma" if they are with another sigma, which was used.
-    ratio : float
-        Of that sigma to the given one.
-    held : tuple of str
-        Parameters that act in no mode of the library.
-    limit : int
-        max_switches.
-    fit : str
-        The message of the best fit.
-
-    See Also
-    --------
-    ModeSearch.ending, find_modes
-
-    Examples
-    --------
-    >>> search = sf.find_modes(heater_problem(), max_switches=1)
-    >>> search.ending.status.name, search.ending.limit
-    ('AT_LIMIT', 1)
-    >>> print(search.ending)  # doctest: +ELLIPSIS
-    At the limit: on -> off has 1 switch, as many as were allowed. Raise max_switches, or give successions ...
-    """
-
-    status: ModeStatus
-    sequences: tuple[tuple[str, ...], ...] = ()
-    other: tuple[tuple[str, ...], ...] = ()
-    difference: float = 0.0
-    criterion: str = ""
-    traceless: bool = False
-    prefers_other: str = ""
-    probability: float = 1.0
-    reason: str = ""
-    ratio: float = 1.0
-    held: tuple[str, ...] = ()
-    limit: int = 0
-    fit: str = ""
-
-
-@dataclass(frozen=True)
-class ModeWarning(Printed):
-    """What may be wrong with a sequence that was found; print it for a sentence.
-
-    Attributes
-    ----------
-    kind : {"short segment", "cut off", "correlated residuals", "criteria differ", "discounted", "no trace", \
-            "not estimated", "outliers"}
-    mode : str
-    run : str
-        Name of the experiment; empty if there is one.
-    begin, end : float
-        Of the segment.
-    samples : int
-        Inside it; or the independent values that all are worth, where criteria were discounted; or outliers.
-    channels : tuple of str
-        Whose residuals are correlated.
-    unit : str
-        Of times.
-    criterion : str
-        That prefers another number of switches.
-    switches : int
-        That number.
-    dispersion : float
-        By which 2 J was divided, where criteria were discounted.
-    parameters : tuple of str
-        That act in none of the modes of the sequence, and keep their guesses.
-
-    See Also
-    --------
-    ModeSearch.warnings, find_modes
-
-    Examples
-    --------
-    >>> print(sf.ModeWarning("criteria differ", criterion="mbic", switches=1))
-    mBIC prefers 1 switch.
-    """
-
-    kind: str
-    mode: str = ""
-    run: str = ""
-    begin: float = 0.0
-    end: float = 0.0
-    samples: int = 0
-    channels: tuple[str, ...] = ()
-    unit: str = ""
-    criterion: str = ""
-    switches: int = 0
-    dispersion: float = 1.0
-    parameters: tuple[str, ...] = ()
-
-
-class Certifier:
-    """Certified estimates of what a search has fitted, each made once.
-
-    Parameters
-    ----------
-    searched : Problem
-        That of the search, whose program the estimates share.
-    given : Problem
-        That of the user, with its tolerances.
-    library : Library
-    """
-
-    def __init__(self, searched: Problem, given: Problem, library: Library) -> None:
-        self.searched, self.given, self.library = searched, given, library
-        self._estimates: dict[tuple[tuple[str, ...], ...], Estimate] = {}
-
-    def build_problem(self, fitted: Fitted) -> Problem:
-        """Return the problem of a schedule: its times are guesses, and parameters that act in none of its modes fixed.
-
-        Parameters
-        ----------
-        fitted : Fitted
-        """
-        searched, library = self.searched, self.library
-        runs = []
-        for schedule, run in zip(fitted.schedules, searched.experiments, strict=True):
-            times = keep_off(spread(schedule, library) or schedule, run.jump_times).times
-            runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(times)))
-        durations = dict(library.durations)
-        shortest = durations if len(set(durations.values())) > 1 else max(durations.values())
-        rtol, atol = self.given.rtol, self.given.atol
-        problem = replace(searched, experiments=runs, min_duration=shortest, rtol=rtol, atol=atol)
-        first, acting = fitted.switches, fitted.acting
-        spans = problem.unknowns.parameters.values()
-        # The entries of an array are estimated all together, or none of them.
-        idle = [range(s.start, s.stop) for s in spans if not acting[s.start - first : s.stop - first].any()]
-        held = [problem.theta_names[i] for span in idle for i in span]
-        return fix_unknowns(problem, held) if held else problem
-
-    def estimate(self, fitted: Fitted) -> Estimate:
-        """Return the certified estimate of a schedule, from where the search has fitted it.
-
-        Parameters
-        ----------
-        fitted : Fitted
-            With something to estimate.
-        """
-        if fitted.sequences not in self._estimates:
-            problem = self.build_problem(fitted)
-            names = self.searched.theta_names[len(self.searched.theta_names) - len(fitted.parameters) :]
-            known = dict(zip(names, fitted.parameters, strict=True))
-            rest = [known[name] for name in problem.theta_names[fitted.switches :]]
-            start = np.concatenate([*(run.initial_times for run in problem.experiments), rest])
-            self._estimates[fitted.sequences] = fit_locally(problem, start=start)
-        return self._estimates[fitted.sequences]
-
-    def find(self, sequences: tuple[tuple[str, ...], ...]) -> Estimate | None:
-        """Return the estimate of some sequences; None if it has not been made."""
-        return self._estimates.get(sequences)
+SEARCH_FORMAT = "switchfit modes"
+SEARCH_VERSION = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -541,7 +334,7 @@ class ModeSearch(SearchRecord, Displayed):
         ('on', 'off')
         """
         file = as_path(path, "path")
-        content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "message": self.message}
+        content: dict[str, Any] = {"format": SEARCH_FORMAT, "version": SEARCH_VERSION, "message": self.message}
         content["search"] = to_json(self, SearchRecord)
         content["search"]["ending"]["status"] = self.status.name
         content["best"] = None if self.best is None else describe_best(self.best)
@@ -581,7 +374,7 @@ class ModeSearch(SearchRecord, Displayed):
         file = as_path(path, "path")
         if problem is not None:
             as_instance(problem, "problem", Problem, "an sf.Problem")
-        content = read_document(file, "a saved search", FORMAT, VERSION)
+        content = read_document(file, "a saved search", SEARCH_FORMAT, SEARCH_VERSION)
         try:
             record = from_json(SearchRecord, content.get("search"), "search")
             best = load_best(content.get("best"))

@@ -1,4 +1,4 @@
-"""Operations on schedules: a mode sequence and its transition times, in a horizon from t0 to tf.
+"""Schedules: a mode sequence and its transition times, in a horizon from t0 to tf, and operations on them.
 
 All functions are pure, and return schedules that their library admits.
 """
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.strategy.beam import keep_apart
+from switchfit.strategy.beam_grid import keep_apart
 from switchfit.strategy.library import Library
 
 CELLS = 12

@@ -1,4 +1,4 @@
-"""The estimator that takes one sample at a time.
+"""The online estimator: mode, transition times and parameters while the samples come in.
 
 Hypotheses on the mode sequence are those of the beam (`switchfit.strategy.beam`). Each sample takes all of them one
 step; each has a child in every mode that may follow, a birth; the best are kept. A further change of mode costs half
@@ -27,20 +27,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.engine.hypotheses import Hypotheses
-from switchfit.estimation.estimator import Estimate
-from switchfit.online.state import Alarm, Best, Now, OnlineStatus, build_kept_problem, calibrate, hold, read_sigma
-from switchfit.online.tracker import (
-    Feed,
-    Settings,
-    Start,
-    StoppedError,
-    Tracker,
-    append_update,
-    invert,
-    read,
-    read_journal,
-    shift_cubic,
-)
+from switchfit.estimation.estimate import Estimate
+from switchfit.online.calibration import calibrate
+from switchfit.online.feed import Feed, shift_cubic
+from switchfit.online.files import append_update, read_journal, read_state
+from switchfit.online.information import invert
+from switchfit.online.kept_problem import build_kept_problem
+from switchfit.online.samples import hold_inputs, read_sigma
+from switchfit.online.state import Alarm, Best, Now, OnlineStatus
+from switchfit.online.tracker import StoppedError, Tracker, TrackerSettings
+from switchfit.online.window_start import Start
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
@@ -52,7 +48,8 @@ from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import Beam
 from switchfit.strategy.choice import estimate
-from switchfit.strategy.library import Rules, build_library
+from switchfit.strategy.library import build_library
+from switchfit.strategy.sequences import Rules
 
 THRESHOLD = 12.0
 """Of 200 drives of 20 s without a change 5 % exceed it."""
@@ -68,7 +65,7 @@ LONGEST_GAP, MOST_BETWEEN = 1.5, 50
 """Time between samples, as a multiple of the usual one, above which nodes are put between: changes happen there, too;
 and how many at most."""
 
-CORNERS = (
+CORNERS_WARNING = (
     "the steps of updates do not end there, and errors of what acts there, as a friction, come out too small. "
     "OnlineEstimator.estimate() has the right ones."
 )
@@ -181,9 +178,13 @@ class OnlineEstimator:
         self._beam = Beam(problem, 0, replace(library, max_switches=slots + entries))
         if self._beam.corners:
             where = ", ".join(self._beam.corners)
-            warnings.warn(f"the modes have corners of the state ({where}): {CORNERS}", RuntimeWarning, stacklevel=2)
+            warnings.warn(
+                f"the modes have corners of the state ({where}): {CORNERS_WARNING}", RuntimeWarning, stacklevel=2
+            )
         rules = Rules.of(library, self._beam.modes)
-        self._settings = Settings(rules, slots, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
+        self._settings = TrackerSettings(
+            rules, slots, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold
+        )
         self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
         pairs = [(k, own) for k, item in enumerate(self._sensors) for own in enumerate(item.names or ())]
         self._channels: dict[str, tuple[int, int]] = {}
@@ -623,7 +624,7 @@ class OnlineEstimator:
         0.1
         """
         file = as_path(path, "path")
-        numbers, arrays = read(file)
+        numbers, arrays = read_state(file)
         online = cls(problem, **settings, threshold=numbers["threshold"])
         online.spacing, online._values, online._renewed = (numbers[n] for n in ("spacing", "_values", "_renewed"))
         online.held = None if numbers["held"] is None else np.array(numbers["held"])
@@ -651,7 +652,7 @@ class OnlineEstimator:
                 data.append(replace(item, times=times[there] + item.delay, values=shown, sigma=sigma))
         inputs = self.problem.experiments[0].inputs
         if inputs is not None and self.held is not None:
-            inputs = hold(inputs, feed.nodes[first:-1].copy(), feed.signals[first : feed.count - 1, 0].copy())
+            inputs = hold_inputs(inputs, feed.nodes[first:-1].copy(), feed.signals[first : feed.count - 1, 0].copy())
         # The path of now may have fewer transitions than have left the window by another.
         past, t0 = min(len(tracker.left), len(now.transition_times)), float(feed.nodes[first])
         sequence, times = now.mode_sequence[past:], now.transition_times[past:]

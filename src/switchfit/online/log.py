@@ -1,4 +1,4 @@
-"""A log, fed to an online estimator sample by sample, and what it said."""
+"""What an online estimator said at each sample of a log that was fed to it, and `replay`, which feeds one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.online.estimator import OnlineEstimator
-from switchfit.online.state import Alarm, Now, OnlineStatus, list_updates
+from switchfit.online.samples import list_updates
+from switchfit.online.state import Alarm, Now, OnlineStatus
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem

@@ -4,18 +4,6 @@ A *node* is a time at which something was measured, or between two such times. A
 kept have children in all modes that may follow, which go on to the next node together with their parents.
 
 The window begins at a `Start`: hypotheses that disagree with the best one about what was before are dropped.
-
-The nodes and samples of a log that grows, in arrays that machine code reads in place.
-
-The start of a window: a state whose uncertainty is that of unknowns that the samples before it have left.
-
-Samples before the window stay as J, g and H, the value, gradient and Gauss-Newton matrix of their cost (the arrival
-cost), in the unknowns ``d = (e, tau, p)``: A = n entries e that shift the state at the start of the window, the
-transition times in the window, and the parameters, ``x = x_w + Z d``. A transition time that leaves the window becomes
-a further entry of e; as n + 1 directions cannot all move n entries of the state, one combination has no effect on the
-state, and the cost takes its minimum along it (the Schur complement).
-
-The state of an online estimator in a file, and the journal of the samples since then.
 """
 
 from __future__ import annotations
@@ -26,308 +14,39 @@ import operator
 from collections import deque
 from itertools import accumulate
 from math import nextafter
-from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.engine.hypotheses import Column, Hypotheses, HypothesisLimits
-from switchfit.engine.native.native_hypotheses import NativeHypotheses
+from switchfit.online.feed import Feed
+from switchfit.online.files import ONLINE_FORMAT
+from switchfit.online.information import drop_artificial, invert
+from switchfit.online.window_start import Past, Start, forget
 from switchfit.strategy.beam import Beam, Pass
-from switchfit.strategy.library import Integers, Rules, Sequences, encode, select_lowest
+from switchfit.strategy.sequences import Integers, Rules, Sequences, encode, select_lowest
 
-NO_EFFECT = 1e-13
-"""Singular value, relative to the largest, below which a combination of unknowns does not move the state."""
-
-KEPT = 32
+KEPT_NODES = 32
 """Nodes whose hypotheses are kept, to go on from them where a sample comes late."""
 
 ALWAYS = 2
 """Hypotheses that are kept whatever their value: with what was declared, and without its last change."""
 
-PER_SEQUENCE = 8
+MOST_OF_ONE_SEQUENCE = 8
 """Hypotheses with the same sequence that are kept, at most. Of fewer, those that fit the noise of the last second best
 leave no room for a change that begins."""
 
-CERTAIN = 200.0
+REFUTED_FROM = 200.0
 """Rise of 2 J without a change from which on it is not looked at anew: what is not fitted anew is too high by less."""
 
 LONGEST_APART = 2.0
 """How far a transition time of two hypotheses may differ, in times between samples, where it leaves the window."""
 
-REPEATED = 12
+MOST_REPEATED = 12
 """Hypotheses that go on where all are propagated anew over the window: parameters get new values, or a sample comes so
 late that the hypotheses at the node before it are not kept."""
-
-NOTHING = 1e-9
-"""Part of the artificial terms of H below which what is left without them is rounding."""
-
-FORMAT = "switchfit online 4"
-
-
-class Feed:
-    """Nodes, signals and samples of a growing log, with room for a number of them.
-
-    Nodes are all times of samples, and others between them. Samples that come late are put in where they belong.
-
-    Parameters
-    ----------
-    engine : NativeHypotheses
-        Whose arrays are replaced.
-    t0 : float
-        First node.
-    capacity : int
-        Of nodes, and of samples of each sensor.
-
-    Attributes
-    ----------
-    signals : (capacity, 4, S)
-        Coefficients of the signals in the cell after each node.
-    """
-
-    def __init__(self, engine: NativeHypotheses, t0: float, capacity: int) -> None:
-        self.capacity, self.count = capacity, 1
-        self._nodes, self.signals, self._samples = engine.reserve(capacity, capacity)
-        self._nodes[0] = t0
-
-    @property
-    def nodes(self) -> FloatArray:
-        """The nodes so far."""
-        return self._nodes[: self.count]
-
-    @property
-    def last(self) -> float:
-        """The last node."""
-        return float(self._nodes[self.count - 1])
-
-    def samples(self, k: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return times (K,), values and weights (K, q) of the samples of sensor k so far."""
-        first, times, values, weights = self._samples[k]
-        end = first[self.count]
-        return times[:end], values[:end], weights[:end]
-
-    def find(self, time: float) -> int:
-        """Return the last node that is not later than a time; -1 if all are."""
-        if time >= self._nodes[self.count - 1]:
-            return self.count - 1
-        return int(self.nodes.searchsorted(time, "right")) - 1
-
-    def insert(self, time: float) -> int:
-        """Put a node where it belongs, and return it. A cell between two others is cut in two; the signals of one at
-        the end are the caller's to write.
-        """
-        node, end = self.find(time) + 1, self.count
-        if end > self.capacity:
-            raise ValueError(f"there is no room for more than {self.capacity} times: raise capacity=, or set window=.")
-        if node < end:
-            self._nodes[node + 1 : end + 1] = self._nodes[node:end].copy()
-            self.signals[node:end] = self.signals[node - 1 : end - 1].copy()
-            self.signals[node] = shift_cubic(self.signals[node - 1], time - self._nodes[node - 1])
-        self._nodes[node] = time
-        for first, *_ in self._samples:
-            first[node + 1 : end + 2] = first[node : end + 1].copy()
-        self.count += 1
-        return node
-
-    def add(self, k: int, node: int, value: FloatArray, weight: FloatArray) -> None:
-        """Add a sample (q,) of sensor k at a node."""
-        first, times, values, weights = self._samples[k]
-        place, end = first[node + 1], first[self.count]
-        if end == self.capacity:
-            raise ValueError(f"there is no room for more than {end} samples: raise capacity=, or set window=.")
-        if place < end:
-            for array in (times, values, weights):
-                array[place + 1 : end + 1] = array[place:end].copy()
-        times[place], values[place], weights[place] = self._nodes[node], value, weight
-        first[node + 1 : self.count + 1] += 1
-
-    def has_sample(self, k: int, node: int) -> bool:
-        """Return whether sensor k has a sample at a node."""
-        first = self._samples[k][0]
-        return bool(first[node + 1] > first[node])
-
-    def drop(self, node: int) -> None:
-        """Forget all nodes before one, which becomes the first, and the samples up to and at it."""
-        end = self.count
-        self._nodes[: end - node] = self._nodes[node:end].copy()
-        self.signals[: end - 1 - node] = self.signals[node : end - 1].copy()
-        self.count -= node
-        for first, *arrays in self._samples:
-            gone, last = first[node + 1], first[end]
-            for array in arrays:
-                array[: last - gone] = array[gone:last].copy()
-            first[: self.count + 1] = first[node : end + 1] - gone
-            first[0] = 0
-
-    def copy_arrays(self) -> dict[str, Any]:
-        """Return what is in the log, by name, for `set_arrays`."""
-        lengths = {"nodes": self.count, "signals": self.count}
-        for k, (first, *_) in enumerate(self._samples):
-            lengths |= {f"{k} 0": self.count + 1} | {f"{k} {i}": int(first[self.count]) for i in (1, 2, 3)}
-        return {name: array[: lengths[name]] for name, array in self._arrays.items()}
-
-    def set_arrays(self, given: dict[str, FloatArray]) -> None:
-        """Replace the log by one that was copied."""
-        self.count = len(given["nodes"])
-        for name, array in self._arrays.items():
-            array[: len(given[name])] = given[name]
-
-    @property
-    def _arrays(self) -> dict[str, Any]:
-        """All arrays by name; only the beginning of each is in use."""
-        samples = {f"{k} {i}": array for k, arrays in enumerate(self._samples) for i, array in enumerate(arrays)}
-        return {"nodes": self._nodes, "signals": self.signals, **samples}
-
-
-def shift_cubic(coefficients: FloatArray, s: float) -> FloatArray:
-    """Return the coefficients (4, S) of cubics in the time since a moment that is s later."""
-    c0, c1, c2, c3 = coefficients
-    return np.stack([c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3])
-
-
-class Start(NamedTuple):
-    """The start of a window.
-
-    Attributes
-    ----------
-    moved : (D,), how far the point of linearisation has moved, 0 but for p
-    cost, gradient, matrix : (), (D,), (D, D), of the samples up to the start, and of the priors
-    state, tangent : (n,), (n, D)
-    """
-
-    moved: FloatArray
-    cost: float
-    gradient: FloatArray
-    matrix: FloatArray
-    state: FloatArray
-    tangent: FloatArray
-
-    def build(self, moved: FloatArray, artificial: FloatArray) -> Hypotheses:
-        """Return B hypotheses at the start that have `moved` (B, D), the times in the window apart.
-
-        Their matrices, of which there is one alone, have `artificial` (D, D) beside what is known.
-        """
-        # J + g'd + d'H d / 2 and g + H d: the quadratic cost of the past at the new point of linearisation.
-        d = moved - self.moved
-        D, rows = len(self.matrix), np.concatenate([self.matrix, self.tangent, self.gradient[None]])
-        along = d @ rows.T
-        slope = along[:, :D]
-        costs = self.cost + along[:, -1] + 0.5 * (slope * d).sum(1)
-        matrices, tangents, states = (self.matrix + artificial)[None], self.tangent[None], self.state + along[:, D:-1]
-        return Hypotheses(costs, costs, self.gradient + slope, matrices, moved, states, tangents)
-
-
-def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: FloatArray) -> tuple[Start, FloatArray]:
-    """Return a start at which parameters have new values, each around its old one.
-
-    The old values join e, since the state depends on them; what has no effect on the state is eliminated, as in `Past`.
-    They are joined to the new ones by ``(p_new - p_old)^2 / (2 variance)``.
-
-    Parameters
-    ----------
-    start : Start
-    entries : int, A
-    chosen : (m,) int, positions of the parameters among the D unknowns
-    variances : (m,), infinite where the old value says nothing about the new one
-
-    Returns
-    -------
-    start : Start
-    turn : (A + m, A), how the new entries e follow from the old ones and the old parameters
-    """
-    D, m = len(start.gradient), len(chosen)
-    old, new = np.concatenate([np.arange(entries), chosen]), np.arange(D, D + m)
-    others = np.setdiff1d(np.arange(D), old)
-    H, g = np.zeros((D + m, D + m)), np.append(start.gradient, np.zeros(m))
-    H[:D, :D] = start.matrix
-    for pair, variance in zip(zip(chosen, new, strict=True), variances, strict=True):
-        # (p_new - p_old)^2 / (2 variance) as a matrix in both.
-        H[np.ix_(pair, pair)] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / variance
-    # x = x_w + Z_old (e, p_old): the right singular vectors split these into combinations that move the state, the new
-    # e, and those that do not.
-    _, sizes, V = np.linalg.svd(start.tangent[:, old])
-    rank = int(np.count_nonzero(sizes > NO_EFFECT * sizes[0]))
-    turn, idle = V[:rank].T, V[rank:].T
-    # The unknowns in their new places, then the combinations without effect, which are eliminated.
-    into = np.zeros((D + m, D + len(idle.T)))
-    into[np.ix_(old, np.arange(rank))], into[np.ix_(old, np.arange(D, into.shape[1]))] = turn, idle
-    into[others, others], into[new, chosen] = 1.0, 1.0
-    H, g = into.T @ H @ into, g @ into
-    # Minimum along the combinations without effect (index 2):
-    #     H_11 - H_12 H_22^+ H_21,  g_1 - H_12 H_22^+ g_2,  J - g_2' H_22^+ g_2 / 2
-    solved = np.linalg.pinv(H[D:, D:], hermitian=True) @ np.column_stack([H[D:, :D], g[D:]])
-    matrix, empty = H[:D, :D] - H[:D, D:] @ solved[:, :-1], np.arange(rank, entries)
-    # Entries of e that are not needed have no effect on the state; with curvature 1 they stay 0.
-    matrix[empty, empty] = 1.0
-    tangent = start.tangent.copy()
-    tangent[:, :entries], tangent[:, chosen] = 0.0, 0.0
-    tangent[:, :rank] = start.tangent[:, old] @ turn
-    cost = start.cost - 0.5 * float(g[D:] @ solved[:, -1])
-    found = start._replace(cost=cost, gradient=g[:D] - H[:D, D:] @ solved[:, -1], matrix=matrix, tangent=tangent)
-    return found, np.pad(turn, ((0, 0), (0, entries - rank)))
-
-
-class Past(NamedTuple):
-    """How the first transition time of a window joins the A entries e before it.
-
-    Attributes
-    ----------
-    rotation : (A + 1, A + 1), orthonormal: of the columns of Z, the last has no effect on the state
-    births : int, transition times that there is room for
-    """
-
-    rotation: FloatArray
-    births: int
-
-    @classmethod
-    def of(cls, tangent: FloatArray, entries: int, births: int) -> Past:
-        """Return it for a tangent (n, D) at the start of the window."""
-        return cls(np.linalg.svd(tangent[:, : entries + 1])[2].T, births)
-
-    def turn(self, values: FloatArray) -> FloatArray:
-        """Return values (..., D) along the unknowns in the new ones; the one without effect becomes the last time."""
-        A = len(self.rotation) - 1
-        first, rest, p = np.split(values, [A + 1, A + self.births], axis=-1)
-        turned = first @ self.rotation
-        return np.concatenate([turned[..., :A], rest, turned[..., A:], p], axis=-1)
-
-    def absorb(self, found: Hypotheses, prior: float) -> None:
-        """Let the first time of B hypotheses join e, in place; its slot is then free for another birth.
-
-        Parameters
-        ----------
-        found : Hypotheses
-            Views of records.
-        prior : float
-            The second derivative that a birth begins with, which the absorbed time loses and the free slot gets.
-        """
-        A = len(self.rotation) - 1
-        free = A + self.births - 1
-        H = np.array(found.matrices)
-        # H_0 of the birth has done its work, to keep the time near its node, unless the data say too little about it.
-        lost = np.zeros(H.shape[1])
-        lost[A] = prior
-        reduced = H - np.diag(lost)
-        certain = np.linalg.eigvalsh(reduced[:, : A + 1, : A + 1])[:, 0] > 1e-9 * prior
-        H = np.where(certain[:, None, None], reduced, H)
-        H = self.turn(self.turn(H).swapaxes(1, 2))
-        g = self.turn(np.array(found.gradients))
-        # Schur complement of the combination without effect, now last among the times; infinity leaves all as it is.
-        pivot = np.where(H[:, free, free] > 0, H[:, free, free], np.inf)
-        row, slope = H[:, free].copy(), g[:, free].copy()
-        found.costs[:] -= 0.5 * slope**2 / pivot
-        g -= row * (slope / pivot)[:, None]
-        H -= row[:, :, None] * row[:, None, :] / pivot[:, None, None]
-        # Its slot is empty: no slope, the curvature of H_0 for the next birth, and no effect on the state.
-        g[:, free], H[:, free], H[:, :, free], H[:, free, free] = 0.0, 0.0, 0.0, prior
-        found.gradients[:], found.matrices[:] = g, H
-        found.tangents[:] = self.turn(np.array(found.tangents))
-        found.tangents[..., free] = 0.0
-        found.moved[:] = self.turn(np.array(found.moved))
-        found.moved[:, free] = 0.0
 
 
 class StoppedError(ValueError):
@@ -357,7 +76,7 @@ class Kept(NamedTuple):
     shift: FloatArray
 
 
-class Settings(NamedTuple):
+class TrackerSettings(NamedTuple):
     """How hypotheses are followed.
 
     Attributes
@@ -407,13 +126,13 @@ class Tracker:
         What the diagonal of H has that is no knowledge.
     """
 
-    def __init__(self, beam: Beam, settings: Settings, parameters: FloatArray, feed: Feed) -> None:
+    def __init__(self, beam: Beam, settings: TrackerSettings, parameters: FloatArray, feed: Feed) -> None:
         self.beam, self.settings, self.feed = beam, settings, feed
         self.first, self.node, self.spacing = 0, -1, beam.grid
         self.declared: NDArray[np.int64] = settings.rules.first[:1]
         self.left: list[Left] = []
         self.start: Start | None = None
-        self.kept: deque[Kept] = deque(maxlen=KEPT)
+        self.kept: deque[Kept] = deque(maxlen=KEPT_NODES)
         self.shift = np.zeros(settings.entries)
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
         # What H has that is no knowledge: a time that a birth begins with is known to half a spacing.
@@ -511,7 +230,7 @@ class Tracker:
 
     def _select(self, value: FloatArray, code: Integers, switches: Integers) -> Integers:
         """Return the best hypotheses, those that are always kept among them."""
-        chosen = select_lowest(value, code, switches, self.settings.width, PER_SEQUENCE)
+        chosen = select_lowest(value, code, switches, self.settings.width, MOST_OF_ONE_SEQUENCE)
         # What was declared, and where there are more modes in the window, that without the last one or two.
         modes = [*(each.mode for each in self.left), *self.declared.tolist()]
         there = code[chosen].tolist()  # if any of a sequence, then its best
@@ -559,7 +278,7 @@ class Tracker:
         value = self.value(kept.switches, found)
         best = {b for b in self.find_best(kept, found, value) if b is not None}
         # A change can be refuted only where the modes before it fit as well as they can.
-        doubted = 2.0 * (value - value.min()) < CERTAIN
+        doubted = 2.0 * (value - value.min()) < REFUTED_FROM
         for modes in (self.declared[:-1], self.declared[:-2]):
             same = doubted & (kept.switches == len(modes) - 1) & (kept.modes[:, : len(modes)] == modes).all(1)
             if same.any():
@@ -603,7 +322,7 @@ class Tracker:
         self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
         self.shift = self.shift - moved[0, :A]
         # Without a transition, hypotheses of earlier nodes that disagree are dropped once they have come to the last.
-        count, followed = (self.node - following + 1 if pasts else 1), deque[Kept](maxlen=KEPT)
+        count, followed = (self.node - following + 1 if pasts else 1), deque[Kept](maxlen=KEPT_NODES)
         while self.kept and len(followed) < count:
             agreeing = self._follow(self.kept.pop(), pasts, modes, times[0, :gone], end)
             if agreeing is None:
@@ -677,7 +396,7 @@ class Tracker:
     def repeat(self, kept: Sequences, found: Hypotheses) -> None:
         """Propagate the best of some hypotheses anew over the window, up to the last node; those of others are lost."""
         last = self.feed.count - 1
-        best = self._select(self.value(kept.switches, found), kept.code, kept.switches)[:REPEATED]
+        best = self._select(self.value(kept.switches, found), kept.code, kept.switches)[:MOST_REPEATED]
         kept, found = kept.take(best), found.take(best)
         times, latest = self._place_births(kept, found.moved, float(self.feed.nodes[last]))
         anew = self._propagate(kept, found.moved, times, kept.switches, last, recentres=True)
@@ -718,7 +437,7 @@ class Tracker:
         arrays |= {"shift": self.shift, "declared": self.declared}
         if self.start is not None:
             arrays |= {f"start {name}": np.asarray(array) for name, array in self.start._asdict().items()}
-        numbers = others | {"format": FORMAT, "first": self.first, "node": self.node, "left": self.left}
+        numbers = others | {"format": ONLINE_FORMAT, "first": self.first, "node": self.node, "left": self.left}
         buffer = io.BytesIO()
         np.savez(buffer, numbers=np.frombuffer(json.dumps(numbers).encode(), dtype=np.uint8), **arrays)
         return buffer.getvalue()
@@ -740,62 +459,3 @@ class Tracker:
             self.start = Start(**start)._replace(cost=float(start["cost"]))
         self.first, self.node = numbers["first"], numbers["node"]
         self.left = [Left(*each) for each in numbers["left"]]
-
-
-def drop_artificial(matrix: FloatArray, artificial: FloatArray) -> FloatArray:
-    """Return H (D, D) without artificial terms (D,) of its diagonal; zeros where nothing else is left."""
-    matrix = matrix - np.diag(artificial)
-    nothing = np.diag(matrix) <= NOTHING * artificial
-    matrix[nothing], matrix[:, nothing] = 0.0, 0.0
-    return matrix
-
-
-def invert(matrix: FloatArray) -> FloatArray:
-    """Return the inverse of a matrix (D, D) of second derivatives, with an infinite diagonal where it is singular."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    there = np.flatnonzero(scale)
-    found = np.diag(np.where(scale > 0, 0.0, np.inf))
-    sizes = np.outer(scale[there], scale[there])
-    try:
-        found[np.ix_(there, there)] = np.linalg.inv(matrix[np.ix_(there, there)] / sizes) / sizes
-    except np.linalg.LinAlgError:
-        found[there, there] = np.inf
-    diagonal = np.diag(found)
-    np.fill_diagonal(found, np.where(diagonal > 0, diagonal, np.inf))
-    return found
-
-
-def read(path: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
-    """Return the numbers and the arrays of a file; ValueError for any other."""
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        numbers = json.loads(arrays.pop("numbers").tobytes())
-    except (ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise ValueError(f"{path} is not a saved online estimator ({error}).") from error
-    if numbers.get("format") != FORMAT:
-        raise ValueError(f"{path} is of another version: it has {numbers.get('format')!r}, not {FORMAT!r}.")
-    return numbers, arrays
-
-
-def append_update(path: Path, t: float, y: dict[int, FloatArray], u: Any) -> None:
-    """Write an update to a journal, with the values of each sensor; it leaves the process before the update begins."""
-    line = json.dumps({"t": t, "y": y, "u": u}, default=lambda value: np.asarray(value, dtype=np.float64).tolist())
-    with path.open("ab", buffering=0) as file:
-        file.write(line.encode() + b"\n")
-
-
-def read_journal(path: Path) -> list[tuple[float, Any, Any]]:
-    """Return the updates of a journal, none without a file; a last one that was cut off is taken out of it."""
-    written = path.read_bytes() if path.exists() else b""
-    whole, _, cut_off = written.rpartition(b"\n")
-    found = []
-    for line in whole.splitlines():
-        try:
-            each = json.loads(line)
-            found.append((each["t"], {int(k): values for k, values in each["y"].items()}, each["u"]))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path} is not the journal of an online estimator ({error}).") from error
-    with path.open("ab") as file:
-        file.truncate(len(written) - len(cut_off))
-    return found

@@ -6,6 +6,9 @@ from collections.abc import Iterable
 from itertools import chain
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.structure import Structure
 from switchfit.problem.tracing import trace_structure
@@ -81,3 +84,22 @@ def find_targets(problem: Problem, structures: Iterable[Structure], *, library: 
         for name, entries in chain(read, named):
             found.setdefault(run.parameter_map.get(name, name), set()).update(entries)
     return found
+
+
+def find_read(problem: Problem, structures: Iterable[Structure], *, library: bool) -> NDArray[np.bool_]:
+    """Return what the functions of a problem read, and the initial states, in the order of theta after the times: (M,).
+
+    Parameters
+    ----------
+    problem : Problem
+    structures : iterable of Structure, one for each experiment
+    library : bool
+        Whether all functions of their libraries count, or those of their sequences alone.
+    """
+    unknowns, read = problem.unknowns, find_targets(problem, structures, library=library)
+    found = np.zeros(len(unknowns.names), dtype=bool)
+    for name, span in unknowns.parameters.items():
+        found[[span.start + i for i in read.get(name, ())]] = True
+    for states in unknowns.initial_states:
+        found[states[states >= 0]] = True
+    return found[int(unknowns.is_time.sum()) :]

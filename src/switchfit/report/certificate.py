@@ -6,7 +6,8 @@ import numpy as np
 
 from switchfit.report.tables import Table, format_table
 from switchfit.runtime.presentation import format_text
-from switchfit.uncertainty.certificate import Certificate, DerivativeCheck
+from switchfit.uncertainty.certificate import Certificate
+from switchfit.uncertainty.derivative_check import DerivativeCheck
 
 # --- certificate ------------------------------------------------------------------------------------------------------
 

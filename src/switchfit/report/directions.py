@@ -9,7 +9,7 @@ from switchfit.report.tables import wrap_text
 from switchfit.report.termination import describe_unread
 from switchfit.report.wording import capitalise, join_words
 from switchfit.runtime.presentation import format_count, format_text
-from switchfit.uncertainty.certificate import Direction, Identifiability
+from switchfit.uncertainty.identification import Direction, Identifiability
 
 RISE_ROUNDING = 1e-12
 """Rise of J, relative to J, that is rounding."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from switchfit.experiment_design import Design
+from switchfit.experiment_design.result import Design
 from switchfit.problem.validation.messages import unit_suffix
 from switchfit.report import panels, style
 from switchfit.report import times as times_module

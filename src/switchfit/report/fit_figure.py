@@ -8,7 +8,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.estimate import Estimate
 from switchfit.fit.result import Fit
 from switchfit.problem.validation.arrays import as_level
 from switchfit.problem.validation.objects import as_flag
@@ -26,8 +26,8 @@ from switchfit.report.selection import choose_runs, count_worst
 from switchfit.report.style import TRANSITION_COLOUR
 from switchfit.runtime.presentation import Axes, Figure
 from switchfit.strategy.validation import Validation
+from switchfit.uncertainty.corrected_errors import find_transition_intervals
 from switchfit.uncertainty.prediction import Prediction, predict
-from switchfit.uncertainty.residuals import find_transition_intervals
 
 RUNS_SIDE_BY_SIDE, INCHES_OF_EACH_RUN = 4, (0.0, 8.0, 5.5, 4.5, 4.0)
 """Experiments side by side; inches of each of so many."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.estimate import Estimate
 from switchfit.report import tables
 from switchfit.report.directions import write_direction
 from switchfit.report.fit_summary import format_rows, list_course, list_experiments, list_quality, tabulate_channels
@@ -13,8 +13,8 @@ from switchfit.report.selection import SCREEN
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.report.unknowns import SMALL_CORRELATION, format_unknowns, tabulate_correlations, tabulate_fixed
 from switchfit.runtime.presentation import format_count, format_text
-from switchfit.uncertainty.certificate import WEAK
-from switchfit.uncertainty.verdict import find_issues
+from switchfit.uncertainty.identification import WEAK
+from switchfit.uncertainty.issues import find_issues
 
 _COVERED = {
     "a mode collapsed": {"idle times", "idle parameters"},

@@ -6,15 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from switchfit.fit.result import Fit, Step
-from switchfit.fit.trajectory import Comparison
+from switchfit.fit.comparison import Comparison
+from switchfit.fit.result import Fit
+from switchfit.fit.search_record import Step
 from switchfit.report import times
 from switchfit.report.numbers import get_unit
 from switchfit.report.shares import format_share
 from switchfit.report.tables import Table, wrap_text
 from switchfit.report.templates import write_agreement
 from switchfit.runtime.presentation import format_count
-from switchfit.uncertainty.residuals import explain_channel, list_channels
+from switchfit.uncertainty.explained_variance import explain_channel
+from switchfit.uncertainty.residuals import list_channels
 
 LABEL = 18
 """Columns of the labels at the left."""

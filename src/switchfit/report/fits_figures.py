@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.batch.bootstrap_study import Bootstrap
 from switchfit.batch.fits import Fits
-from switchfit.batch.simulated import Bootstrap, MonteCarlo
+from switchfit.batch.monte_carlo_study import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.report import selection, style
 from switchfit.report.fits_tables import TOO_FEW, count_minima, select_unknowns_of_fits

@@ -8,8 +8,9 @@ from functools import singledispatch
 
 import numpy as np
 
+from switchfit.batch.bootstrap_study import Bootstrap
 from switchfit.batch.fits import Fits
-from switchfit.batch.simulated import Bootstrap, MonteCarlo
+from switchfit.batch.monte_carlo_study import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.validation.messages import unit_suffix
 from switchfit.report import selection, tables

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
+from switchfit.batch.bootstrap_study import Bootstrap
 from switchfit.batch.fits import Fits
-from switchfit.batch.simulated import Bootstrap
 from switchfit.batch.starts import Multistart
-from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.estimate import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.time_units import SECONDS_OF_UNIT, normalize_time_unit
@@ -20,9 +20,10 @@ from switchfit.report.numbers import format_unit, get_unit
 from switchfit.report.times import format_iso, list_dated
 from switchfit.report.unknowns import list_holds
 from switchfit.runtime.frames import Column, Frame, describe_frame
+from switchfit.uncertainty.corrected_errors import correct_errors, correct_intervals
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.profiles import Profile
-from switchfit.uncertainty.residuals import correct_errors, correct_intervals, list_channels
+from switchfit.uncertainty.residuals import list_channels
 
 ERROR, LOW, HIGH = "{} std. error", "{} low", "{} high"
 """Names of the columns beside an unknown: its standard error, and the ends of its 95 % interval."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from switchfit.modes.result import ModeEnding, ModeStatus, ModeWarning
+from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.validation.messages import join_names, unit_suffix
 from switchfit.runtime.presentation import format_count, format_text
 

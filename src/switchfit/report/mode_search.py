@@ -15,7 +15,7 @@ from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.report.times import Timed, format_estimate, format_time, label_time
 from switchfit.report.wording import ALLOWED
 from switchfit.runtime.presentation import format_count, format_text
-from switchfit.uncertainty.residuals import correct_errors
+from switchfit.uncertainty.corrected_errors import correct_errors
 
 DISCOUNTED = "mBIC discounted"
 """Names of criteria; the last is that of one for residuals that are not noise."""

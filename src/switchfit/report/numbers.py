@@ -9,7 +9,8 @@ import textwrap
 
 import numpy as np
 
-from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.fit.comparison import Comparison
+from switchfit.fit.trajectory import Trajectory
 
 
 def format_rounded(value: float, error: float) -> tuple[str, str, str]:

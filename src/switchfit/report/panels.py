@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
+from switchfit.fit.comparison import Comparison, find_delay
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison, Trajectory, find_delay
+from switchfit.fit.trajectory import Trajectory
 from switchfit.report import style
 from switchfit.report.numbers import format_unit, wrap_quantity
 from switchfit.report.style import (

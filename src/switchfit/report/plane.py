@@ -6,8 +6,8 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from switchfit.estimation.estimator import Estimate
-from switchfit.fit.trajectory import Comparison
+from switchfit.estimation.estimate import Estimate
+from switchfit.fit.comparison import Comparison
 from switchfit.problem.validation.arrays import as_index
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.names import as_names

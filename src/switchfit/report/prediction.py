@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from switchfit.fit.trajectory import find_delay
+from switchfit.fit.comparison import find_delay
 from switchfit.report import panels, style
 from switchfit.report.numbers import wrap_quantity
 from switchfit.report.style import FIT_COLOUR, LINE, THIN, TRANSITION_COLOUR

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.fit.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem

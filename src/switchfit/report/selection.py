@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence, Sized
 
 from switchfit.fit.result import Fit
-from switchfit.uncertainty.residuals import rank_runs
+from switchfit.uncertainty.explained_variance import rank_runs
 
 MOST_DRAWN_RUNS = 10
 """Experiments that one figure shows."""

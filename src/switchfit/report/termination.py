@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from switchfit.fit.result import Kink, Termination
+from switchfit.fit.termination import Kink, Termination
 from switchfit.optimize import Status
 from switchfit.problem.constraints import Constraint
 from switchfit.problem.reads import name_whole_parameters
 from switchfit.report.verdict import write_reason, write_step
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_count, format_text
-from switchfit.uncertainty.verdict import WRITTEN_OTHERWISE
+from switchfit.uncertainty.advice import WRITTEN_OTHERWISE
 
 _FIT_ENDINGS: dict[Status | str, str] = {
     "only unread": "Converged (optimality {optimality:.1e}), but {unread}.",

@@ -12,7 +12,7 @@ from switchfit.report.panels import choose_mode_colours
 from switchfit.report.selection import choose_runs, count_worst
 from switchfit.report.style import FIT_COLOUR, LINE, SMALL, THIN, TRANSITION_COLOUR
 from switchfit.runtime.presentation import Axes, Figure
-from switchfit.uncertainty.residuals import find_transition_intervals
+from switchfit.uncertainty.corrected_errors import find_transition_intervals
 
 LONGEST_TIMELINE = 30
 """Experiments in one timeline."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.estimate import Estimate
 from switchfit.fit.result import Fit
 from switchfit.report import selection, times
 from switchfit.report.numbers import format_rounded, format_unit
@@ -15,7 +15,7 @@ from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.report.times import Timed, format_time
 from switchfit.report.wording import ALLOWED
 from switchfit.runtime.presentation import join_first
-from switchfit.uncertainty.residuals import correct_errors, correct_intervals
+from switchfit.uncertainty.corrected_errors import correct_errors, correct_intervals
 
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which the report calls it asymmetric."""

@@ -12,7 +12,8 @@ from switchfit.report.tables import Table, format_table, join_sections, wrap_tex
 from switchfit.report.wording import ALLOWED
 from switchfit.runtime.presentation import Figure, draw_figure, format_text
 from switchfit.strategy.validation import Validation, convert_to_percent
-from switchfit.uncertainty.residuals import explain_channel, list_channels
+from switchfit.uncertainty.explained_variance import explain_channel
+from switchfit.uncertainty.residuals import list_channels
 
 # --- validation -------------------------------------------------------------------------------------------------------
 

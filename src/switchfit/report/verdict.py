@@ -12,8 +12,10 @@ from switchfit.report.templates import Sentence, describe_starts, suggest_defini
 from switchfit.report.wording import get_figure, join_words, name_first
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_count, format_text
-from switchfit.uncertainty.residuals import NO_RESIDUALS, UNLIKELY
-from switchfit.uncertainty.verdict import LEVELS, NEARLY_ALL, Verdict
+from switchfit.uncertainty.chi_square import UNLIKELY_AS_NOISE
+from switchfit.uncertainty.doubts import NEARLY_ALL, VERDICT_LEVELS
+from switchfit.uncertainty.explained_variance import NO_RESIDUALS
+from switchfit.uncertainty.verdict import Verdict
 
 LISTED_REASONS, LISTED_STEPS = 4, 2
 """Largest numbers of reasons and steps in the line; the data has all of them."""
@@ -126,7 +128,9 @@ def write_step(step: Issue) -> str:
 
 def _write_fit(issue: Issue) -> str:
     """Return how much is explained, and that what is left is noise where a test says so."""
-    is_noise = get_figure(issue, "explained") < 1 - NO_RESIDUALS and get_figure(issue, "probability") >= UNLIKELY
+    is_noise = (
+        get_figure(issue, "explained") < 1 - NO_RESIDUALS and get_figure(issue, "probability") >= UNLIKELY_AS_NOISE
+    )
     return write_explained(issue) + (", what is left is noise" if is_noise else "")
 
 
@@ -160,7 +164,7 @@ def _write_ending(issue: Issue) -> str:
 
 def _describe_many(issue: Issue) -> str:
     """Return how many fits are of each level, and how much of the data they explain."""
-    counts = {level: int(get_figure(issue, level)) for level in LEVELS}
+    counts = {level: int(get_figure(issue, level)) for level in VERDICT_LEVELS}
     parts = join_words([f"{count} {level}" for level, count in counts.items() if count])
     text, worst = f"{parts} of {format_count(sum(counts.values()), 'fit')}", get_figure(issue, "worst")
     if not np.isfinite(worst):

@@ -26,60 +26,49 @@ parameter without a prior, since the linear model would otherwise explain anythi
 
 Where the order of modes is known, it is the only path: hypotheses differ in their times alone. Of the problem of two
 turns of the benchmark 24 of 24 starts then end right; 7 with `REPLAYS` as of a search for the order.
-
-The times between which a beam propagates: a mesh, and the births on a grid among its nodes.
-
-What a generator of mode sequences returns.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import build_arguments
-from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import hypotheses_of
 from switchfit.engine.hypotheses import Column, Hypotheses, HypothesisLimits, HypothesisTolerances
 from switchfit.engine.native.native_hypotheses import NativeHypotheses, OrderTables
-from switchfit.fit.evaluator import assume_noise
+from switchfit.fit.data_variation import assume_noise
 from switchfit.problem.corners.branches import find_corners
-from switchfit.problem.experiment import Experiment
-from switchfit.problem.measurements import Measurements
-from switchfit.problem.parameter import Parameter
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem, place_parameters
-from switchfit.strategy.library import (
-    PER_SEQUENCE,
-    Children,
-    Integers,
-    Library,
-    Rules,
-    Sequences,
-    list_jumps,
-    refuse_unsupported,
-    select_lowest,
-    trace_transitions,
+from switchfit.strategy.beam_grid import (
+    MOST_GRID_INTERVALS,
+    build_mesh,
+    choose_grid,
+    choose_stops,
+    count_values,
+    keep_apart,
+    limit_times,
+    list_sample_times,
 )
-from switchfit.strategy.starts import check_time
+from switchfit.strategy.library import Library
+from switchfit.strategy.library_structure import list_jumps, refuse_unsupported, trace_transitions
+from switchfit.strategy.proposal import Proposal, Quadratic
+from switchfit.strategy.sequences import MOST_PER_SEQUENCE, Children, Integers, Rules, Sequences, select_lowest
+from switchfit.strategy.time_limit import check_time
 
-INTERVALS = 60
-"""Births in the horizon where `grid` is left out, if samples are as frequent."""
-
-COLUMNS, (PARENT, BEFORE, AFTER, SLOT) = len(Column), map(int, list(Column)[:4])
-FUNCTIONS = slice(int(Column.RESET_MAP), int(Column.GUARD) + 1)
+CHILD_COLUMNS, (PARENT, BEFORE, AFTER, SLOT) = len(Column), map(int, list(Column)[:4])
+FUNCTION_COLUMNS = slice(int(Column.RESET_MAP), int(Column.GUARD) + 1)
 
 GUARD_SD = 1e-3
 """Standard deviation of the time of a transition with a guard, as a part of the grid, given the state and p."""
 
-RTOL = 1e-3
+LEAST_BEAM_RTOL = 1e-3
 """Estimated error of a step, relative to the state. The estimate is of order 3, the error of order 5."""
 
 SPREAD, SPREAD_OF_STATES = 0.5, 10.0
@@ -88,7 +77,7 @@ SPREAD, SPREAD_OF_STATES = 0.5, 10.0
 MOST_AT_ONCE = 1.0
 """How far a parameter moves after one grid interval, at most, in its standard deviation without data."""
 
-SMALLEST_PART = 0.1
+SMALLEST_PART_OF_PARAMETER = 0.1
 """Part of a positive parameter below which a beam does not go."""
 
 REPLAYS, REPLAYS_OF_ORDER, LAST_REPLAYS = 4, 24, 3
@@ -97,113 +86,12 @@ REPLAYS, REPLAYS_OF_ORDER, LAST_REPLAYS = 4, 24, 3
 SMALLEST_WIDTH = 1e-6
 """Part of the grid by which a time that is fixed may move: H_0 stays finite."""
 
-LIKELY = 5.0
-"""Standard deviations of the prior of a time within which a beam looks for it."""
-
-STIFFNESS = 1e12
+TIE_STIFFNESS = 1e12
 """Weight of what keeps names of one parameter equal, in units of what a parameter without a prior has: far above what
 data say, and its rounding is far below 1."""
 
 SAMPLES_OF_NOISE = 4.0
 """Weight, in samples, of the noise that is assumed where sigma is unknown, beside that of the residuals."""
-
-
-def choose_grid(run: Experiment) -> float:
-    """Return the time between births: that between samples, but at most `INTERVALS` in the horizon."""
-    shortest = (run.end - run.t0) / INTERVALS
-    gaps = [np.diff(item.times) for item in run.measurements]
-    usual = [float(np.median(gap)) for gap in gaps if len(gap)]
-    return max([shortest, *([min(usual)] if usual else [])])
-
-
-def list_sample_times(run: Experiment) -> FloatArray:
-    """Return the times at which something is measured: (K,), ascending."""
-    times = [item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in run.measurements]
-    return np.unique(np.concatenate([np.zeros(0), *times]))
-
-
-def keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) -> FloatArray:
-    """Return transition times in order, moved as far as modes with these shortest durations (N + 1,) need."""
-    ahead, behind = np.cumsum(shortest[:-1]), np.cumsum(shortest[:0:-1])[::-1]
-    low, high = t0 + ahead, tf - behind
-    later = np.maximum.accumulate(np.maximum(times, low) - ahead) + ahead
-    return np.minimum.accumulate((np.minimum(later, high) + behind)[::-1])[::-1] - behind
-
-
-def build_mesh(run: Experiment, grid: float, marks: FloatArray | Sequence[float] = ()) -> Mesh:
-    """Return the mesh with all required nodes, the times of jumps and `marks`; no cell is longer than the grid."""
-    nodes = np.unique(np.concatenate([Mesh.of(run).times, run.jump_times, marks]))
-    counts = np.maximum(np.ceil(np.diff(nodes) / grid - 1e-9), 1).astype(int)
-    ends = zip(nodes[:-1].tolist(), nodes[1:].tolist(), counts.tolist(), strict=True)
-    inside = [np.linspace(begin, end, count + 1)[1:-1] for begin, end, count in ends]
-    return Mesh.from_times(np.concatenate([nodes, *inside]))
-
-
-def choose_stops(times: FloatArray, grid: float, marks: FloatArray | Sequence[float] = ()) -> NDArray[np.intp]:
-    """Return the nodes of births, `marks` and those nearest to an even grid, between the first and the last node."""
-    wanted = np.arange(times[0] + grid, times[-1] - 0.5 * grid, grid)
-    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
-    nearest = after - (wanted - times[after - 1] < times[after] - wanted)
-    return np.unique(np.concatenate([[0], nearest, np.searchsorted(times, marks).astype(np.intp), [len(times) - 1]]))
-
-
-def count_values(measured: Sequence[Measurements], times: FloatArray) -> FloatArray:
-    """Return the number of measured values up to each node: (G + 1,)."""
-    found = np.zeros(len(times))
-    for item in measured:
-        np.add.at(found, np.searchsorted(times, item.seen_times), (~np.isnan(item.values)).sum(1))
-    return np.cumsum(found)
-
-
-class Quadratic(NamedTuple):
-    """A quadratic cost of parameters and initial states, ``g'd + d'Q d / 2`` with ``d = p - center``."""
-
-    center: FloatArray
-    g: FloatArray
-    Q: FloatArray
-
-    def restrict(self, places: NDArray[np.intp]) -> Quadratic:
-        """Return the cost of some of the parameters, the others being where it is lowest.
-
-        Parameters
-        ----------
-        places : (K,) int array
-        """
-        others = np.setdiff1d(np.arange(len(self.center)), places)
-        g, Q = self.g[places], self.Q[np.ix_(places, places)]
-        if len(others):
-            cross = self.Q[np.ix_(places, others)]
-            solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)
-            g, Q = g - cross @ solved @ self.g[others], Q - cross @ solved @ cross.T
-        return Quadratic(self.center[places], g, Q)
-
-    def evaluate(self, parameters: FloatArray) -> tuple[Any, FloatArray]:
-        """Return the cost of parameters and initial states (..., M), and its gradient."""
-        step = parameters - self.center
-        rise = step @ self.Q
-        return ((self.g + 0.5 * rise) * step).sum(-1), self.g + rise
-
-
-class Proposal(NamedTuple):
-    """A schedule that a generator proposes as the start of a fit.
-
-    Attributes
-    ----------
-    sequences : tuple of tuple of str, one for each experiment
-    transition_times : tuple of (N,) arrays, one for each experiment
-    parameters : (P,) array
-        The problem's free parameters and initial states, in the order of theta after the times.
-    cost : float
-        The generator's estimate of J, plus its penalties: proposals of one call are compared by it.
-    evidence : Quadratic or None
-        Of the best of a beam: what the data of its experiment alone say about the parameters of that.
-    """
-
-    sequences: tuple[tuple[str, ...], ...]
-    transition_times: tuple[FloatArray, ...]
-    parameters: FloatArray
-    cost: float = np.nan
-    evidence: Quadratic | None = None
 
 
 def follow_order(
@@ -226,22 +114,7 @@ def follow_order(
     shortest = np.array([problem.durations[mode] for mode in run.mode_sequence])
     reach = np.array([[-found.grid], [found.grid]])  # a birth moves by up to the grid
     rules = Rules.of_order(modes, shortest, found.limits[: len(modes) - 1].T + reach)
-    return found.run(rules, parameters, 0.0, PER_SEQUENCE * len(modes), replays, evidence)
-
-
-def limit_times(times: Sequence[Parameter], births: int) -> FloatArray:
-    """Return between which values a beam looks for each time of a transition, by its bounds and its prior: (S, 2).
-
-    Only those of a given order of modes have any; of the fit that follows, a prior is a part of J.
-    """
-    found = np.array([[-np.inf, np.inf]] * births)
-    for own, tau in zip(found, times, strict=False):
-        own[:] = (tau.value, tau.value) if tau.fixed else (tau.lower, tau.upper)
-        if tau.prior is not None and not tau.fixed:
-            (center,), (precision,), (log,) = PriorTerms.of(tau.prior, (1,))
-            ends = center + LIKELY * precision**-0.5 * np.array([-1.0, 1.0])
-            own[:] = np.clip(np.exp(ends) if log else ends, *own)
-    return found
+    return found.run(rules, parameters, 0.0, MOST_PER_SEQUENCE * len(modes), replays, evidence)
 
 
 class Beam:
@@ -314,7 +187,7 @@ class Beam:
         marks = self.limits[is_near].mean(axis=1)  # births there, where limits are nearer to each other than the grid
         if any(tau.scale == "log" for tau in run.times):  # whose transitions are as close as the samples there
             seen = list_sample_times(run)
-            marks = np.union1d(marks, seen[:: max(len(seen) // INTERVALS, 1)])
+            marks = np.union1d(marks, seen[:: max(len(seen) // MOST_GRID_INTERVALS, 1)])
         mesh = build_mesh(run, self.grid, marks)
         self.times, self.stops = mesh.times, choose_stops(mesh.times, self.grid, marks)
         mapped = run.parameter_map
@@ -339,7 +212,7 @@ class Beam:
         self.counts = count_values(run.measurements, mesh.times) if is_unknown else None
         self.noise = assume_noise(problem)  # that of all runs
         guards = (self.noise / (GUARD_SD * self.grid)) ** 2
-        self.tolerances = HypothesisTolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, guards)
+        self.tolerances = HypothesisTolerances(max(LEAST_BEAM_RTOL, problem.rtol), problem.atol / problem.rtol, guards)
         self.lock = threading.Lock()
 
     @property
@@ -504,7 +377,7 @@ class Pass:
         beam, (B, S) = self.beam, times.shape
         entries, counts = beam.births - S, np.empty((B, 2), dtype=np.int64)
         counts[:, 0], counts[:, 1] = births, self.rules.modes[kept.modes[:, 0]]
-        children, padded = np.empty((B, beam.births, COLUMNS), dtype=np.int64), np.empty((B, beam.births))
+        children, padded = np.empty((B, beam.births, CHILD_COLUMNS), dtype=np.int64), np.empty((B, beam.births))
         if counts[:, 0].any():  # no others are read
             children[:, :S], padded[:, :S] = self.steps[kept.modes[:, :-1], kept.modes[:, 1:]], times
             children[:, :S, SLOT] = entries + np.arange(S)
@@ -541,7 +414,7 @@ class Pass:
         beam, places = self.beam, self.beam.places
         weak = np.where(beam.priors.precision > 0, 0.0, self.weak)[places]
         matrix = np.diag(np.append(12.0 * (beam.noise / self.reaches) ** 2, weak))
-        matrix[beam.births :, beam.births :] += STIFFNESS * self.weak[places] * beam.ties
+        matrix[beam.births :, beam.births :] += TIE_STIFFNESS * self.weak[places] * beam.ties
         if self.evidence is not None:
             matrix[beam.births :, beam.births :] += self.evidence.Q[places[:, None], places]
         return matrix
@@ -556,15 +429,15 @@ class Pass:
     def steps(self) -> Integers:
         """What a table of children has for each pair of places, (K, K, 7); a hypothesis that stays has no functions."""
         functions, modes = self.beam.functions, self.rules.modes
-        steps = np.full((*functions.shape[1:], COLUMNS), -1, dtype=np.int64)
+        steps = np.full((*functions.shape[1:], CHILD_COLUMNS), -1, dtype=np.int64)
         steps[..., BEFORE], steps[..., AFTER] = modes[:, None], modes
-        steps[..., FUNCTIONS] = np.moveaxis(functions, 0, -1)
+        steps[..., FUNCTION_COLUMNS] = np.moveaxis(functions, 0, -1)
         return steps
 
     def build_limits(self) -> HypothesisLimits:
         """Return the limits of how far birth times and parameters may move from where they began."""
         beam, at = self.beam, self.parameters
-        near = np.where((beam.lower >= 0) & (at > 0), SMALLEST_PART * at, beam.lower)  # 0 may be no value
+        near = np.where((beam.lower >= 0) & (at > 0), SMALLEST_PART_OF_PARAMETER * at, beam.lower)  # 0 may be no value
         low, high, most = np.maximum(beam.lower, near) - at, beam.upper - at, MOST_AT_ONCE * self.spread
         pairs = (-self.reaches, low), (self.reaches, high), (self.reaches, most)
         return HypothesisLimits(*(np.append(of_time, of_p[beam.places]) for of_time, of_p in pairs))

@@ -9,8 +9,6 @@ unknown of theta, also one that a bound, a kink or a collapsed mode holds at the
 terminal constraint, which are equations between unknowns, and one more if sigma is left out: the residual variance is
 then estimated, ``2 J / n``. Priors are no data: they are not in L.
 
-The largest log-likelihood of a model with all constants, and the number of its unknowns.
-
 References
 ----------
 .. [1] K. P. Burnham, D. R. Anderson, Model Selection and Multimodel Inference, 2nd ed., Springer 2002.
@@ -21,75 +19,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimator import Estimate
-from switchfit.fit.trajectory import Comparison
+from switchfit.estimation.estimate import Estimate
 from switchfit.problem.experiment import name_runs
-from switchfit.problem.losses import robust
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation.names import as_labels
 from switchfit.problem.validation.objects import as_instances
-from switchfit.runtime import special
 from switchfit.runtime.presentation import Displayed, format_line, join_first
-
-
-def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comparison]]) -> float:
-    """Return the log-likelihood of all samples, constants included, without priors.
-
-    If sigma is left out, it is the largest over sigma, at ``sigma^2 = 2 J / n``.
-
-    Parameters
-    ----------
-    problem : Problem
-    comparisons : sequence of sequences of Comparison, one for each experiment
-    """
-    total, squares, count = 0.0, 0.0, 0
-    known = problem.is_sigma_known
-    for item, comparison in zip(problem.measurements, chain(*comparisons), strict=True):
-        there = np.isfinite(comparison.residuals)
-        r = comparison.residuals[there]
-        sigma = np.ones(len(r)) if comparison.sigma is None else comparison.sigma[there]
-        u = (r / sigma) ** 2
-        total -= float(np.log(sigma).sum())
-        squares += float(u.sum())
-        count += len(r)
-        if known:
-            total -= 0.5 * float(np.sum(robust(item.loss, item.loss_scale, u)))
-            total -= len(r) * compute_log_norm(item.loss, item.loss_scale)
-    if known:
-        return total
-    return total - 0.5 * count * (np.log(2 * np.pi * squares / count) + 1)
-
-
-def compute_log_norm(loss: str, scale: float) -> float:
-    """Return the logarithm of the integral of ``exp(-rho / 2)`` over residuals in sigmas, by which a loss is a density.
-
-    Infinite for a Cauchy loss with a scale up to 1, which is no density.
-
-    Parameters
-    ----------
-    loss : str
-    scale : float
-    """
-    if loss == "linear":
-        return 0.5 * float(np.log(2 * np.pi))
-    if loss == "cauchy":  # the integral of (1 + z^2 / C^2)^(-C^2 / 2), Student's
-        if scale <= 1:
-            return np.inf
-        a = 0.5 * scale**2
-        return float(np.log(scale) + 0.5 * np.log(np.pi) + special.gammaln(a - 0.5) - special.gammaln(a))
-    from scipy.integrate import quad  # here, since importing it takes longer than most comparisons
-
-    def density(z: float) -> float:
-        return float(np.exp(-0.5 * robust(loss, scale, np.float64(z * z))))
-
-    parts = [quad(density, a, b, epsabs=0.0, epsrel=1e-10)[0] for a, b in ((0.0, scale), (scale, np.inf))]
-    return float(np.log(2 * sum(parts)))
+from switchfit.strategy.likelihood import compute_log_likelihood
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,19 +6,13 @@ bands hold at each time separately, not for the whole curve at once. Where resid
 covariance, as the standard errors of the table of unknowns are: with independent noise assumed, the band of a curve
 would be too narrow by the same factor. sigma is not changed.
 
-At a transition X jumps (see `switchfit.uncertainty.prediction`): just before it the state does not depend on that
+At a transition X jumps (see `switchfit.uncertainty.sensitivity`): just before it the state does not depend on that
 transition time, just after it does. The linear approximation assumes that the active mode is that of the fit, which may
 be wrong within two standard errors of a transition time.
 
 After tf the last mode goes on: the problem is simulated with a later tf. Bands there contain the uncertainty of the
 unknowns and the noise of a sample. They do not contain that of the model: no mode may follow, and the model has no
 process noise.
-
-Sensitivities of states and outputs along a trajectory: exact first derivatives of the discretized system.
-
-The derivative of x at a *fixed* time t jumps where a transition time passes t. With X^i the jump of the vector field,
-equation (8), it is 0 in tau_i just before the transition and -X^i just after. At a transition both are given, one with
-the state before it and one with the state after it.
 
 References
 ----------
@@ -27,26 +21,19 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
-from switchfit.discretization.mesh import Mesh
-from switchfit.engine.choice import engine_of
-from switchfit.engine.run import runs_of
-from switchfit.engine.simulation import Simulation, Tangents
-from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.comparison import find_delay
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import find_delay, read_times, select_visible
+from switchfit.fit.simulation import read_times
 from switchfit.meshes.refinement import refine_mesh
 from switchfit.problem.experiment import show_time
-from switchfit.problem.losses import influence
 from switchfit.problem.origin import Origin
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
@@ -55,190 +42,7 @@ from switchfit.problem.validation.messages import unit_suffix
 from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Figure, draw_figure, format_html, format_line, join_first
-
-
-class Points(NamedTuple):
-    """Values and their derivatives at L times.
-
-    Attributes
-    ----------
-    times : (L,)
-    states, states_d : (L, n), (L, n, d)
-    outputs, outputs_d : (L, Q), (L, Q, d)
-        Outputs of the reference signals, then of the Measurements, in order.
-    """
-
-    times: FloatArray
-    states: FloatArray
-    states_d: FloatArray
-    outputs: FloatArray
-    outputs_d: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Sensitivity:
-    """States and outputs of one experiment and their derivatives in theta.
-
-    Attributes
-    ----------
-    simulation : Simulation
-        With derivatives in the experiment's own unknowns.
-    places : (D,) int
-        Indices of these unknowns in theta, -1 for fixed ones.
-    theta : (d,)
-        Where they are.
-    """
-
-    simulation: Simulation
-    places: NDArray[np.intp]
-    theta: FloatArray
-
-    @property
-    def nodes(self) -> Points:
-        """Points at all nodes in order, as in `Trajectory`: each transition occurs twice, before and after it."""
-        select = partial(select_visible, self.simulation)
-        return self._collect(select(self.simulation.start, self.simulation.end), select)
-
-    def at(self, times: FloatArray) -> Points:
-        """Return the sensitivity at nodes (K,) of the mesh; at a transition, that just before it, as for a sample."""
-        row = self.simulation.row_ending(np.searchsorted(self.simulation.nodes, times) - 1)
-
-        def pick(before: FloatArray, after: FloatArray) -> FloatArray:
-            first = (row < 0).reshape(-1, *[1] * (after.ndim - 1))
-            return np.where(first, before[:1], after[row])
-
-        return self._collect(np.asarray(times, dtype=np.float64), pick)
-
-    def _collect(self, times: FloatArray, choose: Callable[[FloatArray, FloatArray], FloatArray]) -> Points:
-        """Return the points at times (L,), which are chosen from what is known before and after all rows."""
-        s, along = self.simulation, cast(Tangents, self.simulation.tangents)
-        states, outputs = choose(s.before, s.after), choose(s.y_before, s.y_after)
-        slopes = choose(along.before, along.after), choose(along.y_before, along.y_after)
-        states_d, outputs_d = map(self._spread_over_theta, slopes)
-        return Points(times, states, states_d, outputs, outputs_d)
-
-    def _spread_over_theta(self, derivative: FloatArray) -> FloatArray:
-        """Return derivatives in theta (..., d) from those in the experiment's own unknowns (..., D)."""
-        own = self.places >= 0
-        full = np.zeros((*derivative.shape[:-1], len(self.theta)))
-        # Two names of the model may refer to one parameter: both count.
-        np.add.at(np.moveaxis(full, -1, 0), self.places[own], np.moveaxis(derivative, -1, 0)[own])
-        return full
-
-
-def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh) -> Sensitivity:
-    """Return states and outputs of experiment e at theta, and their derivatives in theta, on the nodes of a mesh.
-
-    Parameters
-    ----------
-    problem : Problem
-    e : int
-        Index of the experiment, from 0.
-    theta : (d,)
-    mesh : Mesh
-        It must have all sample times and knots as nodes.
-    """
-    run = runs_of(problem)[e]
-    engine = engine_of(run, run.build_arguments(mesh), mesh)
-    simulation = engine.simulate(*run.vectors(theta), tangents=True)
-    return Sensitivity(simulation, problem.places[e], theta)
-
-
-def compute_sensitivities(evaluator: Evaluator, theta: FloatArray) -> tuple[Sensitivity, ...]:
-    """Return the same of each experiment on the meshes of an evaluator.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    theta : (d,)
-    """
-    each = zip(evaluator.simulate(theta, tangents=True), evaluator.problem.places, strict=True)
-    return tuple(Sensitivity(simulation, places, theta) for simulation, places in each)
-
-
-class SampleDerivatives(NamedTuple):
-    """All samples that are not missing, S over all experiments.
-
-    Attributes
-    ----------
-    experiment : (S,) int
-    item : (S,) int
-        Index of the Measurements in the experiment.
-    residual, weight, influence : (S,)
-        Fitted minus measured, ``1 / sigma**2`` (1 if sigma is unknown), and rho' of the loss (`problem.losses`).
-    derivative : (S, d)
-        Derivative of the fitted value in theta.
-    """
-
-    experiment: NDArray[np.intp]
-    item: NDArray[np.intp]
-    residual: FloatArray
-    weight: FloatArray
-    influence: FloatArray
-    derivative: FloatArray
-
-    @property
-    def scores(self) -> FloatArray:
-        """Gradients of the costs of all samples, ``rho' w r D h``, if no sigma is a parameter: (S, d)."""
-        return (self.influence * self.weight * self.residual)[:, None] * self.derivative
-
-
-def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensitivity]) -> SampleDerivatives:
-    """Return the residuals of all samples and the derivatives of the fitted values.
-
-    Parameters
-    ----------
-    problem : Problem
-        With Measurements and no reference signals; no delay of it is a parameter.
-    sensitivities : sequence of Sensitivity, one per experiment
-    """
-    columns: list[tuple[NDArray[Any], ...]] = []
-    for e, (experiment, found) in enumerate(zip(problem.experiments, sensitivities, strict=True)):
-        first = 0
-        for k, item in enumerate(experiment.measurements):
-            points, there = found.at(item.seen_times), ~np.isnan(item.values)
-            channels = slice(first, first + item.values.shape[1])
-            first = channels.stop
-            sigma = item.noise(problem.name_parameters(found.theta, e))
-            residual = (points.outputs[:, channels] - np.nan_to_num(item.values))[there]
-            weight = np.ones(len(residual)) if sigma is None else sigma[there] ** -2.0
-            pull = influence(item.loss, item.loss_scale, weight * residual**2)
-            places = np.full(len(residual), e), np.full(len(residual), k)
-            columns.append((*places, residual, weight, pull, points.outputs_d[:, channels][there]))
-    return SampleDerivatives(*(np.concatenate(column) for column in zip(*columns, strict=True)))
-
-
-def build_gauss_newton(problem: Problem, theta: FloatArray, samples: SampleDerivatives) -> FloatArray:
-    """Return the Gauss-Newton matrix of the samples and the priors at theta: (d, d).
-
-    A sample contributes ``rho' w (D h)' D h``, and ``2 (D log sigma)' D log sigma`` if its sigma is a parameter: the
-    Fisher information of normal noise, which has nothing between sigma and the rest.
-
-    Parameters
-    ----------
-    problem : Problem
-        No delay of it is a parameter.
-    theta : (d,)
-    samples : SampleDerivatives
-        At theta.
-    """
-    counts, weight = count_values_by_sigma(problem), samples.influence * samples.weight
-    # In log sigma each sample has the information 2, in sigma 2 / sigma^2.
-    of_sigma = 2.0 * counts / np.where(counts > 0, theta, 1.0) ** 2
-    information = np.diag(problem.unknowns.priors.evaluate(theta, gauss_newton=True)[2] + of_sigma)
-    return information + samples.derivative.T @ (weight[:, None] * samples.derivative)
-
-
-def count_values_by_sigma(problem: Problem) -> FloatArray:
-    """Return of how many values each unknown is the sigma: (d,)."""
-    counts = np.zeros(len(problem.theta_names))
-    for run in problem.experiments:
-        for item in run.measurements:
-            for values, name in zip(item.values.T, item.sigma_names, strict=False):
-                span = None if name is None else problem.unknowns.parameters.get(run.parameter_map.get(name, name))
-                if span is not None:  # it is not fixed
-                    counts[span] += np.count_nonzero(~np.isnan(values))
-    return counts
+from switchfit.uncertainty.sensitivity import Points, compute_sensitivity
 
 
 @dataclass(frozen=True, eq=False)

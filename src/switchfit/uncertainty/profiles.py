@@ -12,12 +12,6 @@ that interval.
 Where residuals are correlated, zeta is too large by the factor by which standard errors are too small; on request the
 threshold is multiplied by it ([3]_, "vertical" adjustment).
 
-The points of a profile: march outwards in equal steps of zeta, look for further minima, find crossings. zeta is nearly
-linear in the unknown, so that its crossing of the quantile is found in a few more fits than the march has made. Where
-the next point lies, and where the other unknowns begin there, follows from the derivatives at the point before
-(`switchfit.uncertainty.walks`); then the others are fitted, with the unknown's lower and upper bound set to its value.
-All fits use the compiled program of the original one, on its meshes with halved cells, which follow.
-
 References
 ----------
 .. [1] D. M. Bates, D. G. Watts, Nonlinear Regression Analysis and Its Applications, Wiley 1988, chapter 6.
@@ -30,22 +24,21 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.fit.accuracy import Follower
-from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.minimization import minimize_cost
 from switchfit.fit.result import Fit
-from switchfit.fit.solution import minimize_cost
+from switchfit.meshes.evaluator import Evaluator
+from switchfit.meshes.follower import Follower
 from switchfit.optimize import Status
 from switchfit.optimize.least_distance import nearest_feasible
-from switchfit.problem.problem import Problem
 from switchfit.problem.validation.arrays import as_level
 from switchfit.problem.validation.messages import join_names, shorten, unit_suffix
 from switchfit.problem.validation.names import as_name
@@ -53,80 +46,24 @@ from switchfit.problem.validation.objects import as_callable, as_flag, as_instan
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
 from switchfit.runtime.progress import Progress, show_progress
-from switchfit.uncertainty.residuals import measure_widening
-from switchfit.uncertainty.walks import eliminate_others, find_first_root, list_sample_times, list_transitions
-
-End = Literal["crossed", "limit", "flat", "failed", "stopped"]
-
-STEPS = 5
-"""Points between the estimate and the crossing of the threshold, on each side."""
-
-BEYOND = 1.15
-"""The march continues until zeta is this many times the threshold ..."""
-
-LOOK_AHEAD = 3
-"""... and then adds this many points for a second region, each twice as far out as the one before; twice as many while
-the cost falls outwards."""
-
-MOST_POINTS = 60
-"""Largest number of points on one side."""
-
-LONGEST_GROWTH = 2.5
-"""Largest ratio of a step to the one before."""
-
-FAR = 1e2
-"""A side is flat if the threshold is not crossed up to this many times the unknown's size or its standard error."""
-
-HALVINGS = 8
-"""Largest number of times that a step is reduced because a fit fails or zeta rises too much."""
-
-ITERATIONS = 100
-"""Largest number of iterations of one fit along the profile."""
-
-CREEPING = 1e-3
-"""Fall of J in the second half of them, as a part of that in one unit of zeta, below which the fit has ended too."""
-
-
-def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Return the lower and the upper bounds of all unknowns, (d,) and (d,), with room for all times before and after.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
-    unknowns = problem.unknowns
-    low, high = unknowns.lowest.copy(), unknowns.upper.copy()
-    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        free, times = where >= 0, experiment.initial_times
-        gaps = np.array([problem.durations[mode] for mode in experiment.mode_sequence])  # before each time
-        latest = np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
-        first, last = np.where(free, [low[where], high[where]], times)
-        # Without the gaps before them, times are in order.
-        ahead = np.cumsum(gaps)[: len(where)]
-        earlier = np.maximum.accumulate(np.maximum(first - ahead, experiment.t0)) + ahead
-        later = np.minimum.accumulate(np.minimum(last - ahead, latest - ahead[-1:])[::-1])[::-1] + ahead
-        own = where[free]
-        low[own], high[own] = np.maximum(first, earlier)[free], np.minimum(last, later)[free]
-    return low, high
-
-
-@dataclass(frozen=True, eq=False)
-class Point:
-    """One fit with the unknown held at `value`; slope and curvature of the profile, and how the others follow (d,)."""
-
-    value: float
-    cost: float
-    slope: float
-    curvature: float
-    theta: FloatArray
-    follow: FloatArray
-    converged: bool
-
-    def predict(self, value: float) -> tuple[FloatArray, float]:
-        """Return all unknowns, and the cost, near by."""
-        step = value - self.value
-        cost = self.cost + step * (self.slope + 0.5 * step * self.curvature)
-        return self.theta + np.nan_to_num(step * self.follow), cost
+from switchfit.uncertainty.corrected_errors import measure_widening
+from switchfit.uncertainty.elimination import eliminate_others
+from switchfit.uncertainty.profile_pieces import find_first_root
+from switchfit.uncertainty.profile_trace import (
+    CREEPING,
+    FLAT_UP_TO_SIZES,
+    HALVINGS_OF_STEP,
+    ITERATIONS_OF_PROFILE_FIT,
+    LONGEST_GROWTH,
+    LOOK_AHEAD,
+    MARCHED_BEYOND_THRESHOLD,
+    MOST_POINTS_OF_SIDE,
+    STEPS_TO_THRESHOLD,
+    ProfilePoint,
+    SideEnding,
+    limit_unknowns,
+)
+from switchfit.uncertainty.walks import list_sample_times, list_transitions
 
 
 class Profile(Tabular, Displayed):
@@ -183,7 +120,7 @@ class Profile(Tabular, Displayed):
         # The estimate is feasible: rounding must not put a limit on the wrong side of it.
         self.limits = {-1: float(min(low[k], self.value)), 1: float(max(high[k], self.value))}
         self.jumps: list[float] = []
-        self._ends: dict[int, End] = {-1: "stopped", 1: "stopped"}
+        self._ends: dict[int, SideEnding] = {-1: "stopped", 1: "stopped"}
         self._interrupted = False
         self._should_stop: Callable[[], bool] = bool  # False; unlike a lambda, it can be pickled
 
@@ -325,19 +262,19 @@ class Profile(Tabular, Displayed):
         """Return the size of the root of the likelihood ratio; 0 where the cost is below that of the estimate."""
         return float(np.sqrt(max(2 * (cost - self._centre.cost) / self._scale, 0.0)))
 
-    def _compute_zeta(self, point: Point) -> float:
+    def _compute_zeta(self, point: ProfilePoint) -> float:
         """Return the signed root of the likelihood ratio of a point."""
         size = self._measure_zeta(point.cost)
         return size if point.value > self.value else -size
 
-    def _list_side(self, side: int) -> list[Point]:
+    def _list_side(self, side: int) -> list[ProfilePoint]:
         """Return the points of one side from the estimate outwards, the estimate first, with its derivatives there."""
         beyond = [q for q in self.points if side * (q.value - self.value) > 0]
         return [self._starts[side], *beyond[::side]]
 
     # --- adding points
 
-    def _describe(self, theta: FloatArray, found: Any, converged: bool) -> Point:
+    def _describe(self, theta: FloatArray, found: Any, converged: bool) -> ProfilePoint:
         """Return the point at theta, where the other unknowns are optimal: its slope is the derivative of the cost."""
         k, c = self._index, self._constraints
         others = (theta > c.lower) & (theta < c.upper) & found.hessian.any(axis=1)
@@ -347,9 +284,11 @@ class Profile(Tabular, Displayed):
         (curvature,), _, (follow,) = eliminate_others(*at)
         follow = -follow
         follow[k] = 1.0
-        return Point(float(theta[k]), found.cost, float(found.gradient[k]), float(curvature), theta, follow, converged)
+        return ProfilePoint(
+            float(theta[k]), found.cost, float(found.gradient[k]), float(curvature), theta, follow, converged
+        )
 
-    def _fit(self, value: float, start: FloatArray) -> Point | None:
+    def _fit(self, value: float, start: FloatArray) -> ProfilePoint | None:
         """Return the point at `value`, fitted from the feasible point nearest to a start; None if the fit fails."""
         lower, upper = self._constraints.lower.copy(), self._constraints.upper.copy()
         lower[self._index] = upper[self._index] = value
@@ -357,7 +296,9 @@ class Profile(Tabular, Displayed):
         self.fits += 1
         try:
             begin = nearest_feasible(held, np.clip(start, lower, upper))
-            result = minimize_cost(self._follower, begin, "exact", self.fit.tolerance, ITERATIONS, constraints=held)
+            result = minimize_cost(
+                self._follower, begin, "exact", self.fit.tolerance, ITERATIONS_OF_PROFILE_FIT, constraints=held
+            )
         except ValueError:  # infeasible by rounding
             return None
         if result.status is Status.INTERRUPTED or self._should_stop():
@@ -370,7 +311,7 @@ class Profile(Tabular, Displayed):
         settled = result.status.successful or (creeps and fallen < CREEPING * self._scale)
         return self._describe(result.theta, result, settled)
 
-    def _add(self, value: float, near: Point) -> Point | None:
+    def _add(self, value: float, near: ProfilePoint) -> ProfilePoint | None:
         """Add a point, fitted from what a neighbor predicts; None if all fits fail.
 
         Where they fail, or zeta rises so much more than predicted that this may be another, higher minimum, the
@@ -378,7 +319,7 @@ class Profile(Tabular, Displayed):
         """
         predicted, cost = near.predict(value)
         most = 1.5 * self._measure_zeta(cost) + 0.5
-        best: Point | None = None
+        best: ProfilePoint | None = None
         for start in (predicted, near.theta, self._centre.theta):
             found = self._fit(value, start)
             if found is not None:
@@ -389,7 +330,7 @@ class Profile(Tabular, Displayed):
             self._insert(best)
         return best
 
-    def _insert(self, point: Point) -> None:
+    def _insert(self, point: ProfilePoint) -> None:
         self.points = sorted([q for q in self.points if q.value != point.value] + [point], key=lambda q: q.value)
 
     # --- marching
@@ -398,24 +339,27 @@ class Profile(Tabular, Displayed):
         """Add points on one side until zeta has crossed the threshold, or cannot cross it."""
         if self._interrupted or self._ends[side] in ("limit", "flat", "failed"):
             return
-        if self._measure_zeta(self._list_side(side)[-1].cost) >= BEYOND * threshold:
+        if self._measure_zeta(self._list_side(side)[-1].cost) >= MARCHED_BEYOND_THRESHOLD * threshold:
             self._ends[side] = "crossed"
             return
         self._ends[side] = "stopped"
         self._ends[side] = self._march(side, threshold)
         self._add_minima(side)
 
-    def _march(self, side: int, threshold: float) -> End:
+    def _march(self, side: int, threshold: float) -> SideEnding:
         """Add points outwards; return how this ended."""
         ahead, size = 0, abs(self.value) or 1.0
-        far = FAR * (max(size, self.standard_error) if np.isfinite(self.standard_error) else size)
-        for _ in range(MOST_POINTS):
+        far = FLAT_UP_TO_SIZES * (max(size, self.standard_error) if np.isfinite(self.standard_error) else size)
+        for _ in range(MOST_POINTS_OF_SIDE):
             last = self._list_side(side)[-1]
             height, distance = self._measure_zeta(last.cost), abs(last.value - self.value)
-            step, most = self._choose_step(side, last, threshold / STEPS), height + 2.5 * threshold / STEPS
+            step, most = (
+                self._choose_step(side, last, threshold / STEPS_TO_THRESHOLD),
+                height + 2.5 * threshold / STEPS_TO_THRESHOLD,
+            )
             if last.value == self.limits[side]:
                 return "crossed" if height >= threshold else "limit"
-            if height >= BEYOND * threshold:
+            if height >= MARCHED_BEYOND_THRESHOLD * threshold:
                 if ahead >= LOOK_AHEAD * (1 + (side * last.slope < 0)):
                     return "crossed"
                 ahead, step, most = ahead + 1, distance, np.inf
@@ -428,7 +372,7 @@ class Profile(Tabular, Displayed):
                 self._sweep_inward(side)
         return "crossed" if ahead else "flat"
 
-    def _choose_step(self, side: int, last: Point, spacing: float) -> float:
+    def _choose_step(self, side: int, last: ProfilePoint, spacing: float) -> float:
         """Return the step after which zeta should have risen by the spacing, by the derivatives."""
         points = self._list_side(side)
         # zeta^2 = 2 (J_p - J_0) / scale, so that zeta + spacing is reached where slope x + curvature x^2 / 2 has risen
@@ -441,19 +385,19 @@ class Profile(Tabular, Displayed):
         span = self.limits[1] - self.limits[-1]
         return step if np.isfinite(step) else 1e-2 * float(span if np.isfinite(span) else abs(self.value) or 1.0)
 
-    def _add_next(self, side: int, last: Point, step: float, most: float) -> Point | None:
+    def _add_next(self, side: int, last: ProfilePoint, step: float, most: float) -> ProfilePoint | None:
         """Return the next point outwards; the step is halved while a fit fails or zeta is above `most`, but where it
         jumps.
         """
         limit, before = self.limits[side], np.inf
-        for attempt in range(1, HALVINGS + 1):
+        for attempt in range(1, HALVINGS_OF_STEP + 1):
             value = last.value + side * step
             if side * (value - limit) > -1e-3 * step:
                 value = limit
             new = self._add(value, last)
             if new is not None and new.converged:
                 zeta = self._measure_zeta(new.cost)
-                if attempt == HALVINGS or zeta <= most or zeta > 0.99 * before:  # as high as at twice the step
+                if attempt == HALVINGS_OF_STEP or zeta <= most or zeta > 0.99 * before:  # as high as at twice the step
                     return new
                 before = zeta
             self.points = [q for q in self.points if q is not new]
@@ -468,7 +412,7 @@ class Profile(Tabular, Displayed):
             if side * inner.slope < 0 < side * outer.slope:
                 near = min((inner, outer), key=lambda q: q.cost)
 
-                def cost(value: float, near: Point = near) -> float:
+                def cost(value: float, near: ProfilePoint = near) -> float:
                     found = self._add(value, near)
                     return np.inf if found is None else found.cost
 
@@ -489,7 +433,7 @@ class Profile(Tabular, Displayed):
 
     # --- crossings of the threshold
 
-    def _find_crossing(self, a: Point, b: Point, threshold: float) -> float:
+    def _find_crossing(self, a: ProfilePoint, b: ProfilePoint, threshold: float) -> float:
         """Return where |zeta| equals the threshold, between two neighboring points on different sides of it."""
         found = [a, b]
 
@@ -597,7 +541,9 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     found = Profile(fit, evaluator, name, level)
     with show_progress(callback, f"Profile of {name}") as report:
         # Of as many fits as a profile usually takes.
-        found._should_stop = lambda: bool(report(found.fits, max(2 * (STEPS + LOOK_AHEAD + 2), found.fits)))
+        found._should_stop = lambda: bool(
+            report(found.fits, max(2 * (STEPS_TO_THRESHOLD + LOOK_AHEAD + 2), found.fits))
+        )
         try:
             found._find_regions(fit.quantile(level))
         except KeyboardInterrupt:

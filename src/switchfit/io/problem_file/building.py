@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from switchfit.estimation.estimator import Provenance, make_relative
+from switchfit.estimation.provenance import Provenance, make_relative
 from switchfit.io.problem_file.digests import digest_file, list_files
 from switchfit.io.problem_file.experiments import Runs, build_experiments, load_named_object
 from switchfit.io.problem_file.logs import Opened

@@ -15,17 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.estimate import Estimate
+from switchfit.fit.comparison import Comparison, find_delay
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison, find_delay
 from switchfit.report.fit_figure import has_bands
 from switchfit.report.numbers import format_unit, get_unit
 from switchfit.report.panels import replace_infinities
 from switchfit.report.plane import find_plane
 from switchfit.report.times import format_estimate
 from switchfit.report.unknowns import format_end
-from switchfit.uncertainty.prediction import Points, predict
-from switchfit.uncertainty.residuals import correct_errors, find_transition_intervals
+from switchfit.uncertainty.corrected_errors import correct_errors, find_transition_intervals
+from switchfit.uncertainty.prediction import predict
+from switchfit.uncertainty.sensitivity import Points
 
 MOST_POINTS_OF_CURVE, FEWEST_POINTS_OF_CURVE = 800, 80
 """Points of one curve: with more of them a figure looks the same."""

@@ -14,7 +14,8 @@ from bokeh.core.serialization import Serializer
 from bokeh.embed import json_item
 from bokeh.resources import Resources
 
-from switchfit.estimation.estimator import Estimate, Provenance
+from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.provenance import Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.validation.messages import unit_suffix
 from switchfit.report.certificate import tabulate_certificate
@@ -39,8 +40,8 @@ from switchfit.report.unknowns import select_unknowns_of_fit, tabulate_correlati
 from switchfit.report.verdict import list_reasons, write_reason, write_step
 from switchfit.report.wording import join_words
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.residuals import explain_worst, rank_runs
-from switchfit.uncertainty.verdict import find_issues
+from switchfit.uncertainty.explained_variance import explain_worst, rank_runs
+from switchfit.uncertainty.issues import find_issues
 
 MOST_RUNS_IN_PAGE = 12
 """Experiments whose figures are in a page, those that are explained worst."""

@@ -1,0 +1,166 @@
+"""Fits of data that are simulated at a truth and perturbed by drawn noise.
+
+All fits share meshes that resolve the trajectories at the start and at the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from switchfit.arrays import FloatArray
+from switchfit.batch.layout import Varying
+from switchfit.batch.programs import Limits
+from switchfit.batch.study import Study
+from switchfit.discretization.mesh import Mesh
+from switchfit.estimation.local_fit import REFINEMENTS
+from switchfit.fit.comparison import compare
+from switchfit.meshes.evaluator import Evaluator
+from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, ORDER_OF_METHODS, cost_error
+from switchfit.problem.measurements import Measurements
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation.arrays import as_array
+from switchfit.problem.validation.messages import shorten
+from switchfit.problem.variants import replace_values
+
+Noise = float | ArrayLike | Callable[[np.random.Generator, FloatArray, Any], ArrayLike] | None
+
+Values = dict[tuple[int, int], FloatArray]
+"""Values of data that are simulated, by the experiment and the place among its data: (K, q), or (R, K, q) of R runs."""
+
+
+def build_study(
+    problem: Problem, truth: FloatArray, begin: FloatArray, noise: Noise, seed: int, limits: Limits
+) -> tuple[SimulatedStudy, float]:
+    """Return fits of simulated data, to be done by `repeat`, and the integration error at the truth.
+
+    Parameters
+    ----------
+    problem, noise, seed : as of `monte_carlo`
+    truth, begin : (d,)
+        Where the data are simulated, and where every fit begins.
+    limits : Limits
+    """
+    clean = simulate_clean(problem, truth)
+    drawn = noise if callable(noise) else _find_spreads(problem, truth, noise, clean)
+    study = SimulatedStudy(problem, [], begin[None], limits, seed, drawn, clean)
+    study.meshes, error = _build_meshes(study.problem_of(0), truth, begin)
+    return study, error
+
+
+def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
+    """Return what data would be without noise."""
+    found: Values = {}
+    comparisons = compare(Evaluator(problem, truth).halved, truth)[1]
+    for e, (experiment, run) in enumerate(zip(problem.experiments, comparisons, strict=True)):
+        places = [k for k, item in enumerate(experiment.data) if isinstance(item, Measurements)]
+        if not places or any(comparison.kind != "measurements" for comparison in run):
+            raise ValueError("monte_carlo simulates Measurements: every run needs some, and none a ReferenceSignal.")
+        found |= {(e, k): comparison.fitted for k, comparison in zip(places, run, strict=True)}
+    return found
+
+
+def _find_spreads(problem: Problem, truth: FloatArray, noise: Any, clean: Values) -> Values:
+    """Return the standard deviations of the noise of all data, (K, q) each."""
+    found = {}
+    for (e, k), values in clean.items():
+        item, sigma = problem.experiments[e].data[k], noise
+        if sigma is None:
+            sigma = item.noise(problem.name_parameters(truth, e))
+        if sigma is None:
+            raise ValueError(
+                "noise must be given, since the data have no sigma from which to draw: a standard deviation, one for "
+                "each channel, or a function."
+            )
+        try:
+            found[e, k] = np.broadcast_to(np.asarray(sigma, dtype=float), values.shape)
+        except ValueError as error:
+            raise ValueError(f"noise of shape {np.shape(sigma)} does not fit data of shape {values.shape}.") from error
+        if not np.all(np.isfinite(found[e, k]) & (found[e, k] >= 0)):
+            raise ValueError(f"noise must be zero or positive; got {shorten(sigma)}.")
+    return found
+
+
+def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[list[Mesh], float]:
+    """Return meshes that resolve the trajectories at the start and at the truth, and the integration error at the
+    truth.
+
+    A mode that is active in another part of the horizon at the start would run over cells that are far too long for it,
+    and lead somewhere else altogether.
+    """
+    finer = 1.0
+    thetas = (truth,) if np.array_equal(start, truth) else (start, truth)
+    for attempt in range(REFINEMENTS + 1):
+        evaluator = Evaluator(problem, *thetas, finer=finer)
+        fine = evaluator.halve_rows(truth).cost(truth)
+        # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
+        error = cost_error(problem, fine, evaluator(truth).cost, evaluator(start).cost)
+        excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
+        if not excess > 1 or attempt == REFINEMENTS:
+            break
+        finer *= 1.1 * excess ** (1 / ORDER_OF_METHODS)
+    return evaluator.meshes, float(error)
+
+
+@dataclass
+class SimulatedStudy(Study):
+    """The runs of a Monte Carlo study.
+
+    Attributes
+    ----------
+    noise : callable, or Values
+        The function of the user, or standard deviations.
+    clean : Values
+        As of `simulate_clean`.
+    """
+
+    noise: Any
+    clean: Values
+
+    def draw_run(self, run: int) -> Values:
+        """Return the values of one run."""
+        rng, drawn = np.random.default_rng([self.seed, run]), {}
+        for (e, k), clean in self.clean.items():
+            if callable(self.noise):
+                noisy = self.noise(rng, clean.copy(), self.problem.experiments[e].data[k])
+                values = as_array(noisy, "what noise(rng, clean, item) returns")
+            else:
+                values = clean + self.noise[e, k] * rng.standard_normal(clean.shape)
+            is_finite = bool(np.isfinite(values).all())
+            if values.shape != clean.shape or not is_finite:
+                raise ValueError(
+                    f"noise must give finite values of shape {clean.shape}; got shape {values.shape}"
+                    f"{'' if is_finite else ', not all finite,'} in run {run}."
+                )
+            drawn[e, k] = values
+        return drawn
+
+    def problem_of(self, run: int) -> Problem:
+        """Return the problem with the data of one run."""
+        return replace_values(self.problem, self.draw_run(run))
+
+    def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
+        """Return the data of some runs, and the errors of those whose noise cannot be drawn, by their places."""
+        drawn, errors = [], {}
+        for place, run in enumerate(runs):
+            try:
+                drawn.append(self.draw_run(run))
+            except Exception as error:  # listed: it must not end the other runs
+                drawn.append(self.clean)
+                errors[place] = error
+        return self.stack_values({key: np.stack([values[key] for values in drawn]) for key in self.clean}), errors
+
+    def stack_values(self, values: Values) -> Varying:
+        """Return noisy values (R, K, q) of all data as leaves of the arguments."""
+        (leaves, places), changed = self.leaves, {}
+        for e, experiment in enumerate(self.problem.experiments):
+            measured = [(k, item) for k, item in enumerate(experiment.data) if isinstance(item, Measurements)]
+            for samples, (k, item) in zip(places[e].samples, measured, strict=True):
+                own, leaf = values[e, k], samples.value
+                changed[leaf] = np.zeros((len(own), *leaves[leaf].shape))
+                changed[leaf][:, : len(item.times)] = np.where(np.isnan(item.values), 0.0, own)
+        return changed
