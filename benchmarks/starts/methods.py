@@ -15,7 +15,7 @@ from benchmarks.starts import peers
 from benchmarks.starts.case import Case
 from benchmarks.starts.end import End
 from switchfit import optimize
-from switchfit.fit import solution
+from switchfit.fit import minimization
 
 Method = Callable[[Case, np.ndarray], End]
 
@@ -44,7 +44,7 @@ def time_optimizer() -> Iterator[list[float]]:
         finally:
             seconds.append(time.perf_counter() - began)
 
-    with patch.object(solution, "minimize", minimize):
+    with patch.object(minimization, "minimize", minimize):
         yield seconds
 
 

@@ -23,7 +23,7 @@ _MODULES = {
     "Design": "experiment_design.result",
     "DerivativeCheck": "uncertainty.derivative_check",
     "Direction": "uncertainty.identification",
-    "Estimate": "estimation.estimate",
+    "Estimate": "estimation.estimates",
     "Evaluation": "engine.evaluation",
     "Experiment": "problem.experiment",
     "Fits": "batch.fits",

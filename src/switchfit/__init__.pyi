@@ -10,7 +10,7 @@ from switchfit.batch.starts import Multistart as Multistart
 from switchfit.batch.starts import multistart as multistart
 from switchfit.discretization.stiffness import Stiffness as Stiffness
 from switchfit.engine.evaluation import Evaluation as Evaluation
-from switchfit.estimation.estimate import Estimate as Estimate
+from switchfit.estimation.estimates import Estimate as Estimate
 from switchfit.experiment_design.result import Design as Design
 from switchfit.experiment_design.search import design as design
 from switchfit.fit.comparison import Comparison as Comparison

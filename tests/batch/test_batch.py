@@ -19,7 +19,7 @@ from support.heated_rooms import ROOM, TIMES, TRUTH, room
 from support.models import climb, decay, one_run, refused, rest, slow_guess, temperature
 from support.optimizer import minimize, solve_qp
 from support.optimizer import rows as linear
-from switchfit.batch import batch, programs, simulated_study, starts
+from switchfit.batch import batch, simulated_study, starts
 from switchfit.batch import layout as layout_module
 from switchfit.batch.batch import Batch
 from switchfit.batch.chunks import run_chunks
@@ -527,7 +527,7 @@ def test_an_error_of_the_program_itself_is_said(monkeypatch):
     def fail(*given, layout):
         raise TypeError("unhashable layout")
 
-    monkeypatch.setattr(programs, "minimize_fits", fail)
+    monkeypatch.setattr(batch, "minimize_fits", fail)
     settings = {"theta": TRUTH, "seed": 1}
     with pytest.warns(RuntimeWarning, match=r"failed \(TypeError: unhashable layout\); they are done one by one"):
         study = sf.monte_carlo(room(), 3, **settings)
@@ -589,7 +589,7 @@ def test_what_the_program_does_not_settle_is_fitted_from_its_start(monkeypatch, 
         theta[1], settled[1] = [0.0, 5.0], False
         return outcome._replace(theta=theta, settled=settled)
 
-    monkeypatch.setattr(programs, "minimize_fits", leave_one)
+    monkeypatch.setattr(batch, "minimize_fits", leave_one)
     found = Batch(problem, meshes, {}, LIMITS).fit(starts)
     assert finished == [((2.0, 0.9), 200 - expected.iterations[1])], "together they have what was allowed"
     np.testing.assert_allclose(found.theta, expected.theta, rtol=0, atol=1e-8)

@@ -14,7 +14,7 @@ import scipy.stats
 import switchfit as sf
 from support import models
 from support.models import fit_problem
-from switchfit.estimation import estimate as estimate_module
+from switchfit.estimation import estimates
 from switchfit.estimation.insignificance import drop_noise_of_times
 from switchfit.fit.minimization import minimize_cost
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
@@ -161,8 +161,8 @@ def test_badly_scaled_unknowns_take_the_same_iterates():
 
 
 def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
-    simulate = Mock(side_effect=estimate_module.compare)
-    monkeypatch.setattr(estimate_module, "compare", simulate)
+    simulate = Mock(side_effect=estimates.compare)
+    monkeypatch.setattr(estimates, "compare", simulate)
     fit = sf.estimate(capacitor(voltage(TIMES)))
     simulate.assert_not_called()
     assert fit.trajectories is fit.trajectories

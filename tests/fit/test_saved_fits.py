@@ -16,7 +16,7 @@ from support.equal_fits import CERTIFICATE, assert_same
 from support.fits_by_hand import NOTHING, comparison_of, made, several, trajectory_of
 from support.models import RAMP
 from support.places import SAVED
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.saving import FIT_FORMAT, FIT_VERSION, save_fit
 from switchfit.fit.result import Fit
 from switchfit.fit.termination import Kink

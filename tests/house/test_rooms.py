@@ -9,7 +9,7 @@ import switchfit as sf
 PACKAGE = Path(sf.__file__).parent
 
 LAYERS = (
-    "arrays", "runtime", "optimize", "problem", "models", "discretization", "engine", "meshes", "paper_adjoint", "fit",
+    "arrays", "runtime", "optimize", "problem", "models", "discretization", "engine", "paper_adjoint", "meshes", "fit",
     "uncertainty", "estimation", "strategy", "batch", "modes", "online", "experiment_design", "report", "io", "paper",
     "cli", "__main__",
 )  # fmt: skip

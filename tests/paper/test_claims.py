@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import switchfit as sf
 from support.places import ROOT
 from switchfit.cli import app
-from switchfit.paper import convergence, magic_reference, noise, oscillator, studies, trials
+from switchfit.paper import convergence, magic_reference, noise, oscillator, trials
 from switchfit.paper.parts import PARTS, Part
 from switchfit.paper.runner import format_comparison, run
 from switchfit.paper.table_rows import TableRow
@@ -162,7 +162,7 @@ def test_an_interrupted_run_goes_on_with_what_is_missing_and_one_part_alone_leav
 
 
 def test_interrupted_study_is_not_taken_for_a_result(monkeypatch):
-    monkeypatch.setattr(studies, "fit_locally", Mock(return_value=Mock(status=sf.Status.INTERRUPTED)))
+    monkeypatch.setattr(noise, "fit_locally", Mock(return_value=Mock(status=sf.Status.INTERRUPTED)))
     with pytest.raises(KeyboardInterrupt):
         noise.compute_noise(True, lambda text: None)
 

@@ -19,7 +19,7 @@ from support.equal_fits import CERTIFICATE, assert_same
 from support.fits_by_hand import made, several, trajectory_of
 from support.log_folders import fill_folder
 from support.models import RAMP, heated_room, one_run, temperature
-from switchfit.batch import fits_archive
+from switchfit.batch import fits as fits_module
 from switchfit.batch.archives import compute_seal
 from switchfit.cli.tables import write_runs, write_unknowns
 from switchfit.fit.result import Fit
@@ -203,7 +203,7 @@ def test_files_that_hold_no_fits(studies, heater, tmp_path, monkeypatch):
     whole = path.read_bytes()
     with pytest.raises(ValueError, match=r"holds the kind of fits 'MonteCarlo', not Bootstrap: sf\.Fits\.load reads"):
         sf.Bootstrap.load(path)
-    monkeypatch.setattr(fits_archive, "FITS_VERSION", 4)
+    monkeypatch.setattr(fits_module, "FITS_VERSION", 4)
     with pytest.raises(ValueError, match="is a file of saved fits of version 3; this switchfit reads version 4"):
         sf.Fits.load(path)
     heater.save(tmp_path / "fit.json")

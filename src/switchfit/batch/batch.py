@@ -26,7 +26,7 @@ from switchfit.batch.program_inputs import ProgramInputs, replace_leaves
 from switchfit.batch.programs import GPU_LOCK, Limits, compile_once, evaluate_fits, minimize_fits
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.corners.branches import has_corners
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.minimization import minimize_cost
 from switchfit.fit.result import list_kinks
 from switchfit.fit.termination import Kink, Termination, termination_of

@@ -26,7 +26,7 @@ from switchfit.batch.resampled_data import ResampledNoise, StudyOfRuns
 from switchfit.batch.simulated_study import build_study
 from switchfit.batch.study import Study
 from switchfit.batch.study_verdict import judge_study
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.scaled_hessian import inverse_on
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem

@@ -18,7 +18,7 @@ from switchfit.batch.archives import read_arrays, write_arrays
 from switchfit.batch.doubts import find_doubts, has_converged
 from switchfit.batch.ends import Ends
 from switchfit.batch.fits_archive import FITS_FORMAT, FITS_VERSION, describe_best, load_best, split_fields
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.statistics import interval, measure_quantile, measure_variance
 from switchfit.problem.origin import Origin
 from switchfit.problem.validation.arrays import as_level

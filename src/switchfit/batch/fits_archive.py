@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import make_dataclass
 from typing import Any, get_type_hints
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.saving import parse_fit, write_fit
 from switchfit.runtime.json_records import find_dtype
 from switchfit.uncertainty.certificate import certify
@@ -43,4 +43,7 @@ def load_best(content: Any) -> Estimate | None:
     content : mapping or None
         As `describe_best` returned it.
     """
-    return None if content is None else parse_fit(content)
+    if content is None:
+        return None
+    fit, certificate = parse_fit(content)
+    return Estimate(**vars(fit), saved_certificate=certificate)

@@ -34,7 +34,7 @@ import numpy as np
 from switchfit.arrays import FloatArray
 from switchfit.batch.layout import Varying
 from switchfit.batch.study import Study
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.data_variation import measure_variation
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem

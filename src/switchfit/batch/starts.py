@@ -20,7 +20,7 @@ from switchfit.batch.programs import Limits
 from switchfit.batch.study import Study
 from switchfit.batch.study_verdict import judge_starts
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.optimize import Status

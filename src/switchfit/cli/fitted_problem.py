@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.cli.toml_writer import write_table
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.provenance import make_relative
 from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.user_files import replace_files

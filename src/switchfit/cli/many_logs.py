@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from switchfit.cli.tables import list_columns, list_unknowns, write_rows
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.io.logs.files import find_logs, name_files
 from switchfit.report import numbers as numbers_module
 from switchfit.report.frames import ERROR

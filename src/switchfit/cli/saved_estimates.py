@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.provenance import Provenance
 from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.problem_file.digests import digest_file

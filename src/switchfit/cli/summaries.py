@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.cli.tables import list_unknowns, zip_rows
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.experiment_design.result import Design, DesignRecord
 from switchfit.fit.trajectory import Trajectory
 from switchfit.meshes.evaluator import Evaluator

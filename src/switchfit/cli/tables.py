@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.report.selection import SCREEN
 from switchfit.runtime.frames import describe_frame
 from switchfit.uncertainty.quality import measure_quality

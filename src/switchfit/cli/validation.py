@@ -30,7 +30,7 @@ def validate(
     """
     from switchfit.cli.saved_estimates import list_changed_models, load_other_run
     from switchfit.cli.summaries import summarize_validation
-    from switchfit.estimation.estimate import Estimate
+    from switchfit.estimation.estimates import Estimate
 
     estimate = Estimate.load(saved)
     loaded = load_other_run(saved, estimate.provenance, other, folder)

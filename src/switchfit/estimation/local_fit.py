@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.estimation.ending import describe_ending, find_undefined_function
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.insignificance import drop_noise_of_times, is_within_error
 from switchfit.fit.minimization import minimize_cost
 from switchfit.meshes.evaluator import Evaluator, evaluator_of

@@ -18,7 +18,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from switchfit.estimation.estimate import Estimate
 from switchfit.estimation.provenance import Provenance, make_relative
 from switchfit.fit.result import Fit
 from switchfit.runtime.json_documents import write_document
@@ -80,8 +79,8 @@ def _compute_seal(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()
 
 
-def parse_fit(content: Mapping[str, Any]) -> Estimate:
-    """Return an estimate, without its model, from the content of a file of this version.
+def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
+    """Return a fit and its certificate from the content of a file of this version.
 
     Parameters
     ----------
@@ -94,5 +93,4 @@ def parse_fit(content: Mapping[str, Any]) -> Estimate:
     """
     if not isinstance(content, Mapping) or content.get("seal") != _compute_seal(content):
         raise ValueError("its content is not what was written")
-    certificate = from_json(Certificate, content["certificate"], "certificate")
-    return Estimate(**vars(from_json(Fit, content["fit"], "fit")), saved_certificate=certificate)
+    return from_json(Fit, content["fit"], "fit"), from_json(Certificate, content["certificate"], "certificate")

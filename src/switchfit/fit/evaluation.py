@@ -13,7 +13,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation.names import as_choice
 from switchfit.problem.validation.objects import as_instance
 
-EVALUATION_METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
+EVALUATION_METHODS: tuple[Method, ...] = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
 
 
 def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation[FloatArray]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.modes.fitted import Fitted
 from switchfit.modes.schedule import keep_off, spread

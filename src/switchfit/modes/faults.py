@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.modes.certifier import Certifier
 from switchfit.modes.criterion import INFORMATION, CriterionName, compute_weights
 from switchfit.modes.fitted import Fitted

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.modes.criterion import Score
 from switchfit.uncertainty.doubts import NEARLY_ALL
 from switchfit.uncertainty.explained_variance import explain_all

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.batch.fits_archive import describe_best, load_best
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.modes.certifier import Certifier
 from switchfit.modes.fitted import Fitted
 from switchfit.modes.library_problem import build_library_problem

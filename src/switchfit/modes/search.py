@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Score
 from switchfit.modes.result import ModeSearch
 from switchfit.modes.search_run import Method, SearchProgress, SearchRun, SearchSettings, build_result

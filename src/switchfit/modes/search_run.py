@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.modes.certifier import Certifier
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.faults import assume_fault, count_outliers

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.engine.hypotheses import Hypotheses
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.online.calibration import calibrate
 from switchfit.online.feed import Feed, shift_cubic
 from switchfit.online.files import append_update, read_journal, read_state

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.simulation import simulate
 from switchfit.optimize import Status

@@ -8,7 +8,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.result import Fit
 from switchfit.problem.validation.arrays import as_level
 from switchfit.problem.validation.objects import as_flag

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.report import tables
 from switchfit.report.directions import write_direction
 from switchfit.report.fit_summary import format_rows, list_course, list_experiments, list_quality, tabulate_channels

@@ -12,7 +12,7 @@ from switchfit.arrays import FloatArray
 from switchfit.batch.bootstrap_study import Bootstrap
 from switchfit.batch.fits import Fits
 from switchfit.batch.starts import Multistart
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.time_units import SECONDS_OF_UNIT, normalize_time_unit

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.report.convergence import plot_convergence
 from switchfit.report.fit_figure import plot_fit
 from switchfit.report.plane import plot_plane

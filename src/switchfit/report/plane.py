@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.comparison import Comparison
 from switchfit.problem.validation.arrays import as_index
 from switchfit.problem.validation.messages import join_names, shorten

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.result import Fit
 from switchfit.report import selection, times
 from switchfit.report.numbers import format_rounded, format_unit

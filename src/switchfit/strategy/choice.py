@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.search_record import Rival
 from switchfit.meshes.evaluator import evaluator_of

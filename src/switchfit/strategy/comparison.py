@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation.names import as_labels

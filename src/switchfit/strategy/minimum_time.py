@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
 from switchfit.strategy.many_starts import MOST_STARTS, SAME_COST, Starts, try_starts

@@ -8,7 +8,7 @@ from operator import itemgetter
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.search_record import Rival
 from switchfit.meshes.evaluator import evaluator_of
 from switchfit.meshes.follower import Follower

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.problem.data import count_from
 from switchfit.problem.dates import Dates
 from switchfit.problem.experiment import Experiment, show_time

@@ -17,7 +17,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.search_record import Rival, Step
 from switchfit.optimize import Status
 from switchfit.problem.problem import Problem

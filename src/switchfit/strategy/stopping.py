@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.data_variation import measure_variation
 from switchfit.fit.search_record import Step
 from switchfit.fit.statistics import count_priors, count_samples

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.comparison import Comparison, compare
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory

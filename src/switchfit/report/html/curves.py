@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.fit.comparison import Comparison, find_delay
 from switchfit.fit.result import Fit
 from switchfit.report.fit_figure import has_bands

@@ -14,7 +14,7 @@ from bokeh.core.serialization import Serializer
 from bokeh.embed import json_item
 from bokeh.resources import Resources
 
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.provenance import Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.validation.messages import unit_suffix

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimate import Estimate
+from switchfit.estimation.estimates import Estimate
 from switchfit.report.html.curves import Curves
 from switchfit.report.numbers import format_unit
 from switchfit.report.times import describe_clock, list_dated

@@ -773,7 +773,8 @@ class Estimate(Fit, Tabular, Displayed):
         file = as_path(path, "path")
         content = read_document(file, "a saved estimate", FIT_FORMAT, FIT_VERSION)
         try:
-            found = parse_fit(content)
+            fit, certificate = parse_fit(content)
+            found = Estimate(**vars(fit), saved_certificate=certificate)
             provenance = from_json(Provenance | None, content.get("provenance"), "provenance")
         except (ValueError, OverflowError, RecursionError, MemoryError) as error:
             raise ValueError(f"{path} is damaged: {error}.") from error
