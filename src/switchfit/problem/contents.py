@@ -22,6 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.runtime.jax_internals import is_tracer
+
 TRUSTED = frozenset(
     {"jax", "jaxlib", "numpy", "scipy", "math", "cmath", "functools", "operator", "itertools", "typing"}
 )
@@ -85,7 +87,7 @@ def _read(value: Any) -> Hashable:
 
 
 def _read_array(value: Any) -> Hashable:
-    if isinstance(value, jax.core.Tracer) or value.dtype.hasobject:
+    if is_tracer(value) or value.dtype.hasobject:
         raise NotPlain
     array = np.asarray(value)
     digest = hashlib.blake2b(array.tobytes(), digest_size=16).digest()

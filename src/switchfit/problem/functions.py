@@ -7,7 +7,6 @@ decides whether a trace can be reused without calling the user's function.
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import itertools
 import threading
@@ -20,7 +19,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.interpreters import partial_eval
 
 from switchfit.problem.contents import JITTED, read_contents
 from switchfit.problem.jaxpr_text import describe_jaxpr
@@ -28,6 +26,7 @@ from switchfit.problem.jaxprs import find_read_entries, list_jaxprs
 from switchfit.problem.traced_constants import refuse_wrong_constants
 from switchfit.problem.validation.messages import join_names
 from switchfit.problem.validation.objects import find_misfit
+from switchfit.runtime.jax_internals import copy_literals, drop_unused, evaluate_jaxpr, forget_names
 
 Array = jax.Array
 Shape = tuple[int, ...]
@@ -90,7 +89,7 @@ class Function:
 
     def evaluate(self, given: Sequence[Any]) -> Array:
         """Evaluate for the arguments of the jaxpr: the parameters are the last."""
-        return jax.core.eval_jaxpr(self.jaxpr, self.consts, *given)[0]
+        return evaluate_jaxpr(self.jaxpr, self.consts, *given)[0]
 
     @cached_property
     def read(self) -> dict[str, tuple[int, ...]]:
@@ -112,7 +111,7 @@ class Function:
             structs[2] = jax.ShapeDtypeStruct((2, *structs[2].shape), structs[2].dtype)
         closed = jax.make_jaxpr(evaluate)(*structs)
         # Without what has no use: a corner does not take all of its mode, and is one in branches on its other sides.
-        jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=True)
+        jaxpr, _ = drop_unused(closed.jaxpr, True)
         return Function(closed.replace(jaxpr=jaxpr), self.parameters)
 
     def __hash__(self) -> int:
@@ -200,19 +199,12 @@ def _trace(call: Call, parameters: Mapping[str, Shape]) -> Function:
     closed = jax.make_jaxpr(evaluate)(*(jax.ShapeDtypeStruct(size, jnp.float64) for size in shapes))
     refuse_wrong_constants(closed, call.what)
     is_kept = [True] * count + [False] * len(parameters)
-    jaxpr, is_read = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=is_kept)
-    _copy_literals(jaxpr)
-    consts = [np.array(const) if isinstance(const, np.ndarray) else const for const in closed.consts]
-    closed = type(closed)(jaxpr.replace(debug_info=jaxpr.debug_info.with_unknown_names()), consts)
-    return Function(closed, tuple(compress(parameters, is_read[count:])))
-
-
-def _copy_literals(jaxpr: Any) -> None:
-    """Copy the literals of a jaxpr: JAX keeps references to the user's arrays without axes, which may change."""
+    jaxpr, is_read = drop_unused(closed.jaxpr, is_kept)
     for each in list_jaxprs(jaxpr):
-        for atom in (*each.outvars, *(atom for equation in each.eqns for atom in equation.invars)):
-            if isinstance(getattr(atom, "val", None), np.ndarray):
-                atom.val = copy.deepcopy(atom.val)
+        copy_literals(each)
+    consts = [np.array(const) if isinstance(const, np.ndarray) else const for const in closed.consts]
+    closed = type(closed)(forget_names(jaxpr), consts)
+    return Function(closed, tuple(compress(parameters, is_read[count:])))
 
 
 # Calling a user's function while tracing

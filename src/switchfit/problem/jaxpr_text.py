@@ -12,6 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from switchfit.runtime.jax_internals import evaluate_jaxpr
+
 # The content of a jaxpr
 
 UNCOMPARED_PARAMETERS = (
@@ -41,7 +43,7 @@ def _differentiate_twice(closed: Any) -> Any:
     """Return the jaxpr of the first and second derivatives along all arguments, in which custom rules are applied."""
 
     def value(*arguments: Any) -> Any:
-        return jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *arguments)[0]
+        return evaluate_jaxpr(closed.jaxpr, closed.consts, *arguments)[0]
 
     def slope(*arguments: Any) -> Any:
         return jax.jvp(value, arguments, arguments)[1]

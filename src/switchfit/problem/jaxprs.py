@@ -10,7 +10,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax._src import source_info_util
+
+from switchfit.runtime.jax_internals import find_traced_function, find_user_line
 
 SELECTIONS: dict[str, Callable[[Any, Any], Any]] = {
     "slice": lambda a, at: a[
@@ -129,8 +130,8 @@ def find_line(equation: Any) -> str:
     ----------
     equation : operation of a jaxpr
     """
-    frame = source_info_util.user_frame(equation.source_info.traceback)
-    return "" if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
+    found = find_user_line(equation)
+    return "" if found is None else f"{os.path.basename(found[0])}:{found[1]}"
 
 
 def find_public_name(jaxpr: Any) -> str | None:
@@ -143,8 +144,8 @@ def find_public_name(jaxpr: Any) -> str | None:
     ----------
     jaxpr : that of the function
     """
-    info = getattr(getattr(jaxpr, "jaxpr", jaxpr), "debug_info", None)
-    file, name = getattr(info, "func_filename", None), str(getattr(info, "func_name", "")).lstrip("_")
+    file, name = find_traced_function(jaxpr)
+    name = name.lstrip("_")
     if file is None or not file.startswith(os.path.dirname(jax.__file__) + os.sep):
         return None
     for module in PUBLIC:

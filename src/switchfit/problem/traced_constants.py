@@ -16,10 +16,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax._src import source_info_util
 
 from switchfit.problem.jaxprs import Walk, find_inner_jaxprs, find_line
 from switchfit.problem.validation.precision import is_low_precision, refuse_single_precision
+from switchfit.runtime.jax_internals import is_user_file, list_calls
 
 KEEPING = frozenset(
     {"slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "concatenate", "rev", "gather", "stack", "copy"}
@@ -149,7 +149,6 @@ def _is_update(equation: Any) -> bool:
     """Return whether a scatter is an update of the user, ``x.at[index].set(value)``, and not one by JAX, as derivatives
     of ``x.at[index].get(mode="fill")`` are.
     """
-    calls = pairwise(code for code, _ in zip(*equation.source_info.traceback.raw_frames(), strict=True))
-    is_of_user = source_info_util.is_user_filename
-    found = next((inner for inner, outer in calls if is_of_user(outer.co_filename)), None)
+    calls = pairwise(list_calls(equation))
+    found = next((inner for inner, outer in calls if is_user_file(outer.co_filename)), None)
     return found is not None and found.co_qualname.startswith(WRITER) and found.co_name != "get"

@@ -13,19 +13,18 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
 import platformdirs
-from jax.experimental.compilation_cache import compilation_cache as jax_cache
 
 from switchfit.runtime.files import write_atomically
+from switchfit.runtime.jax_internals import replace_compilation_cache, reset_compilation_cache
 
 SETTINGS: dict[str, Any] = {
     "jax_compilation_cache_dir": None,  # the folder, when it is known
@@ -48,13 +47,13 @@ def use_compilation_cache() -> Iterator[None]:
     try:
         for name, value in settings.items():
             jax.config.update(name, value)
-        jax_cache.reset_cache()  # JAX decides once whether to use a cache; this makes it decide again
-        _use_whole_files(path)
+        reset_compilation_cache()
+        replace_compilation_cache(_WholeFiles(path))
         yield
     finally:
         for name, value in before.items():
             jax.config.update(name, value)
-        jax_cache.reset_cache()
+        reset_compilation_cache()
 
 
 def get_usable_folder() -> Path | None:
@@ -147,11 +146,3 @@ class _WholeFiles:
 
     def put(self, key: str, value: bytes) -> None:
         write_code(self._path / f"jax-{key}", value)
-
-
-def _use_whole_files(path: Path) -> None:
-    """Replace JAX's cache by `_WholeFiles`. The names are private: if JAX changes them, its own cache remains."""
-    internals: Any = sys.modules[jax_cache.reset_cache.__module__]
-    with getattr(internals, "_cache_initialized_mutex", nullcontext()):
-        # Under JAX's own lock, which guards the two together; another thread may be compiling.
-        internals._cache_initialized, internals._cache = True, _WholeFiles(path)

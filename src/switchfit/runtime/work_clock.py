@@ -11,8 +11,7 @@ from contextlib import contextmanager
 
 from jax import monitoring
 
-COMPILING = "/jax/core/compile/jaxpr_to_mlir_module_duration", "/jax/core/compile/backend_compile_duration"
-"""JAX's names of what it does when it compiles."""
+from switchfit.runtime.jax_internals import COMPILE_EVENTS
 
 _compiled = [0.0]
 
@@ -34,7 +33,7 @@ def stop_clock() -> Iterator[None]:
 
 def _count_compilation(event: str, duration_secs: float, **kwargs: str | int) -> None:
     # Whatever thread compiles: the clock is that of a limit of time for the whole process.
-    if event in COMPILING:
+    if event in COMPILE_EVENTS:
         _compiled[0] += duration_secs
 
 

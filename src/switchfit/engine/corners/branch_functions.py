@@ -12,6 +12,7 @@ from switchfit.arrays import FloatArray, Traced
 from switchfit.engine.native.tracing.trace import trace_scalars
 from switchfit.engine.native.tracing.unsupported import Unsupported
 from switchfit.problem.functions import Function, use_float64
+from switchfit.runtime.jax_internals import evaluate_jaxpr
 
 
 @lru_cache(maxsize=1024)
@@ -22,7 +23,7 @@ def trace_for_numpy(function: Function) -> Callable[..., FloatArray]:
     It takes times () or (L,), what moves with them, states (n,) or (L, n) and maybe the input (size,) or (L, size), for
     branches with its rate behind it, and the parameters.
     """
-    call = lambda *given: jax.core.eval_jaxpr(function.jaxpr, function.consts, *given)  # noqa: E731
+    call = lambda *given: evaluate_jaxpr(function.jaxpr, function.consts, *given)  # noqa: E731
     shapes = [struct.shape for struct in function.structs]
     with use_float64():
         try:

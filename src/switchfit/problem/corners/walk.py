@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax._src import source_info_util
 from numpy.typing import NDArray
 
 from switchfit.problem.jaxprs import SELECTIONS, Walk, evaluate, find_line, list_jaxprs
 from switchfit.problem.traced_constants import FOLDED
+from switchfit.runtime.jax_internals import keep_user_line
 
 Array = Any
 
@@ -268,7 +268,7 @@ def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
 
 def _bind(equation: Any, values: Sequence[Any], origin: Any) -> list[Any]:
     """Evaluate an operation as JAX does, with the line of the user's code from which it comes."""
-    with source_info_util.user_context(origin.source_info.traceback):
+    with keep_user_line(origin):
         return evaluate(equation, values)
 
 

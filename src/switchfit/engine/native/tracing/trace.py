@@ -14,7 +14,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.interpreters import partial_eval
 
 from switchfit.engine.native.scalars.graph import Graph
 from switchfit.engine.native.scalars.template import Template
@@ -26,6 +25,7 @@ from switchfit.engine.native.tracing.moves import MOVING_OPERATIONS
 from switchfit.engine.native.tracing.rules import ARRAY_RULES
 from switchfit.engine.native.tracing.unsupported import Unsupported
 from switchfit.problem.jaxprs import Walk, find_line, find_public_name, list_jaxprs
+from switchfit.runtime.jax_internals import drop_unused
 
 __all__ = ["Unsupported", "trace_scalars"]
 
@@ -52,7 +52,7 @@ def trace_scalars(
     try:
         closed = _make_jaxpr(function, structs)
         # Without what has no use: there, no operation has to be finite.
-        jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
+        jaxpr, _ = drop_unused(closed.jaxpr, True)
         with np.errstate(all="ignore"):
             outputs = _Tracing(graph).run(jaxpr, closed.consts, inputs)
         if any(variable.aval.dtype != np.float64 for variable in closed.jaxpr.outvars):
