@@ -10,6 +10,7 @@ import switchfit as sf
 from support import swings as protocol
 from support.derivatives import differentiate
 from support.models import decay, fit_problem, refused
+from switchfit.meshes.evaluator import evaluator_of
 
 COOLS = sf.HybridSystem({"cools": decay}, [1.0])
 
@@ -41,7 +42,7 @@ def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
     problem = closed_problem(engine=engine)
     assert problem.theta_names == ("tau_1", "tf", "a", "k")
     expected = differentiate(closed_cost, problem.initial_theta)
-    found = sf.evaluate(problem, method=method)
+    found = evaluator_of(problem)(problem.initial_theta, method=method)
     assert found.cost == pytest.approx(float(expected[0]), rel=1e-11)
     np.testing.assert_allclose(found.gradient, expected[1], rtol=0, atol=1e-9)
     np.testing.assert_allclose(found.hessian, expected[2], rtol=0, atol=1e-8)

@@ -11,7 +11,7 @@ import pytest
 
 import switchfit as sf
 from support import models
-from switchfit.meshes.evaluator import Evaluator
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.runtime.errors import HiddenSwitchError
 from switchfit.uncertainty.identification import identifiability
 
@@ -70,7 +70,7 @@ MOMENTS = {
 def test_derivatives_at_hard_moments_are_those_of_the_closed_form(this, where, method):
     """One-sided where they jump: for increasing times, as `evaluate` says."""
     tau = MOMENTS[where]
-    found = sf.evaluate(this, tau, method=method)
+    found = evaluator_of(this)(np.array(tau), method=method)
     cost, gradient, hessian = expected(tau, 1)
     assert found.cost == pytest.approx(cost, rel=1e-7)
     np.testing.assert_allclose(found.gradient, gradient, rtol=0, atol=1e-6)

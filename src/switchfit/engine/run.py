@@ -9,10 +9,10 @@ from functools import cached_property
 
 from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments, build_common_arguments, put_on_mesh
-from switchfit.discretization.corner_times import find_corner_times
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.corners.branches import Branches, find_branches, has_corners
 from switchfit.engine.corners.path import BranchPath
+from switchfit.problem.corners.times import find_corner_times
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.structure import Structure
@@ -56,7 +56,8 @@ class Run:
     @cached_property
     def corner_times(self) -> FloatArray:
         """Known times of corners, whatever theta is."""
-        return find_corner_times(self.structure, self.experiment, self._common.fixed)
+        nodes = Mesh.of(self.experiment).times
+        return find_corner_times(self.structure, self.experiment, self._common.fixed, nodes)
 
     def vectors(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what its programs take at theta (d,): its times (N,) and its p (M,)."""

@@ -38,6 +38,8 @@ from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
+"""By what the derivatives are evaluated; "discrete-adjoint" is JAX with a backward sweep for the Hessian, as the
+fallback of "auto" takes it, and "autodiff" the same as "forward"."""
 
 
 class Evaluator:

@@ -1,7 +1,7 @@
 """Corners that follow from t, the input and fixed parameters alone, such as those of ``clip(u, -2, 2)``.
 
 They are compiled as functions of time. The times at which they are met are known before anything runs, and are nodes of
-every mesh: `switchfit.discretization.corner_times` finds them.
+every mesh: `switchfit.problem.corners.times` finds them.
 """
 
 from __future__ import annotations

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.discretization.mesh import Mesh
 from switchfit.problem.corners.timed import compile_timed_corners
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.functions import use_float64
@@ -34,10 +33,13 @@ ZERO_LEVEL = 1e-13
 """Part of the largest |g| that counts as 0: a signal that stays at its limit does not cross it by rounding."""
 
 
-def find_corner_times(structure: Structure, experiment: Experiment, fixed: Sequence[Any]) -> FloatArray:
+def find_corner_times(
+    structure: Structure, experiment: Experiment, fixed: Sequence[Any], nodes: FloatArray
+) -> FloatArray:
     """Return the times of these corners in modes and running costs; of a jump, the times just before and behind it.
 
-    `fixed` are the values of the parameters that are not estimated, in the order of the structure.
+    `fixed` are the values of the parameters that are not estimated, in the order of the structure; `nodes` the times
+    that are nodes of every mesh of the experiment anyway, among them its ends.
     """
     named = dict(zip((name for name, _, read in structure.parameters if not read), fixed, strict=True))
     found: list[FloatArray] = []
@@ -46,7 +48,6 @@ def find_corner_times(structure: Structure, experiment: Experiment, fixed: Seque
         corners = compile_timed_corners(function, known)
         if corners is not None:
             evaluate = partial(_evaluate, corners, experiment, structure, [np.asarray(named[k], float) for k in known])
-            nodes = Mesh.of(experiment).times
             bends, jumps = _find_crossings(evaluate, nodes)
             # At a jump f has two values: with nodes just before and behind it, a row of the length 2e-10 of the horizon
             # is all that has stages on both sides.
