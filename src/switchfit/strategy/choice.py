@@ -24,7 +24,7 @@ from switchfit.problem.validation.names import as_choice
 from switchfit.problem.validation.objects import as_callable, as_instance
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.progress import Line, show_line
-from switchfit.runtime.work_clock import measure_work
+from switchfit.runtime.work import measure_work
 from switchfit.strategy.known_order import explain_no_beam
 from switchfit.strategy.other_minima import find_other_minima
 from switchfit.strategy.search import Search, Strategy
@@ -33,8 +33,9 @@ from switchfit.strategy.time_limit import limit_time
 
 STRATEGIES = get_args(Strategy)
 
-LEAST_TIME, TIMES_LOCAL = 2.0, 20.0
-"""Seconds that searches take at most where no budget is given, or so many times what the first fit took."""
+LEAST_WORK, TIMES_LOCAL = 5.0, 20.0
+"""Work of searches where no budget is given, in seconds of `measure_work`, or so many times that of the first fit. It
+is counted: in seconds of a clock, answers would depend on what else the machine does."""
 
 MOST_ITERATIONS_BY_DEFAULT = 200
 """Most iterations of a fit on one mesh, unless said otherwise."""
@@ -145,12 +146,10 @@ def estimate(
             if strategy == "local":
                 raise
             failure = error
-        most = np.inf if strategy == "thorough" else max(LEAST_TIME, TIMES_LOCAL * (measure_work() - prepared))
+        most = np.inf if strategy == "thorough" else max(LEAST_WORK, TIMES_LOCAL * (measure_work() - prepared))
 
         def limit_searches() -> AbstractContextManager[None]:
-            """Return the limit of time of searches that begin now: what is left of the budget; without one, no time in
-            which programs are compiled counts, so that no verdict depends on what is compiled already.
-            """
+            """Return the limit of searches that begin now: what is left of the budget, or else counted work."""
             if budget is None:
                 return limit_time(most, measure_work, callback)
             return limit_time(budget - (time.perf_counter() - began), time.perf_counter, callback)

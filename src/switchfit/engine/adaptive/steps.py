@@ -20,9 +20,13 @@ from switchfit.engine.native.native_experiment import NativeExperiment
 from switchfit.problem.functions import use_float64
 from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.errors import NotIntegrableError
+from switchfit.runtime.work import count_work
 
 Slope = Callable[[float, FloatArray], FloatArray]
 """The derivative (n + 1,) of the state and of the running cost so far at a time."""
+
+STEP_ADDITIONS = 1e6
+"""Additions in the time that a step takes in Python: a millisecond, of six calls of a slope by JAX."""
 
 
 class NativeStepsError(Exception):
@@ -106,6 +110,7 @@ class PythonSteps:
         """Take a step; return the accepted time (1,) and the state there (1, n), none if it has failed."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused
             self.message = self._solver.step()
+        count_work(STEP_ADDITIONS)
         self.t, self.y, self.is_running = float(self._solver.t), self._solver.y, self._solver.status == "running"
         # After a step that failed SciPy's t and y are those before it: there is nothing new.
         taken = slice(int(self.message is None))

@@ -29,6 +29,10 @@ from switchfit.problem.functions import use_float64
 from switchfit.problem.padding import pad_length
 from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
+from switchfit.runtime.work import CALL, count_work
+
+ROW_ADDITIONS = 2000.0
+"""Additions in the time that a row takes in a program of JAX, for each unknown."""
 
 
 class JaxEngine:
@@ -81,6 +85,8 @@ class JaxEngine:
         with use_float64(), nullcontext() if key in self._compiled else use_compilation_cache():
             found = program(self._on_device, *given, structure=self._any_sequence, **settings)
         self._compiled.add(key)
+        tau, p = given[:2]
+        count_work(CALL + ROW_ADDITIONS * (1 + len(tau) + len(p)) * (self._mesh.cells + len(tau)))
         return found
 
     def constrained(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray) -> DenseEvaluation:

@@ -21,6 +21,7 @@ from switchfit.engine.native.scalars.graph import CHECKED
 from switchfit.engine.native.sizes import Order, Sizes, constants_of
 from switchfit.engine.simulation import Simulation, Tangents
 from switchfit.problem.structure import Structure
+from switchfit.runtime.work import CALL, count_work
 
 
 def native_experiment(
@@ -66,6 +67,7 @@ class NativeExperiment:
         self._rows = layout.constraint_rows
         self._lengths = {name: fixed + each * (cells + N) for name, (fixed, each) in layout.memory.items()}
         self._size = sum(self._lengths.values())
+        self._work = CALL + (cells + N) * max(self._module.row_work, default=0.0)
         places = places_in_library(structure)
         given: dict[str, Any] = {
             "nodes": times,
@@ -297,6 +299,7 @@ class NativeExperiment:
         self._check[0] = 0.0
         given = self._address, self._cells, *map(get_address, (state, y, rows)), most, get_address(count)
         self._find(f"adaptive_{mode}_steps", len(given))(*given)
+        count_work(CALL + count.item(0) * self.row_work[mode])
         # 0, or NaN: the solver's caller sees a state that is not finite.
         y += self._check[0]
         return rows[: count[0], 0], rows[: count[0], 1:-1]
@@ -333,6 +336,7 @@ class NativeExperiment:
         self._find_late_cells(p)
         if multipliers is not None:
             self._multipliers[self._constraint_rows] = multipliers
+        count_work(self._work)
         try:
             self._function(self._address, *self._counts)
         finally:

@@ -23,6 +23,7 @@ from switchfit.engine.native.hypothesis_memory import (
 from switchfit.engine.native.layout import get_address
 from switchfit.engine.native.llvm.compilation import Program
 from switchfit.engine.native.sizes import Order, Sizes, constants_of
+from switchfit.runtime.work import CALL, count_work
 
 Integers = NDArray[np.int64]
 
@@ -94,6 +95,8 @@ class NativeHypotheses:
             self._set_samples(k, first, *values)
         self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
         self._table_at = get_address(self._table)
+        work = code.modules[Order.GAUSS_NEWTON].work
+        self._cell_work = float(sum(work.values()))
         prefix = program_cache.ORDER_PREFIXES[Order.GAUSS_NEWTON]
         self._propagate = code.function(f"{prefix}propagate", 13)
         self._follow_order = code.function(f"{prefix}follow_order", 14)
@@ -182,6 +185,7 @@ class NativeHypotheses:
         records[0, at], wide[0, at], numbers[0] = parents, births, np.bincount(places, minlength=K)
         given = records, numbers, ranks, wide, *order
         sizes = K, births.shape[1], first, last, self._cells
+        count_work(CALL + (last - first) * K * PER_PLACE * self._cell_work)
         self._follow_order(self._table_at, *map(get_address, given), *sizes)
         end = (last - first) % 2
         kept = np.arange(room) < numbers[end, :, None]
@@ -233,6 +237,7 @@ class NativeHypotheses:
         records, last = np.empty((len(counts), self.record_size)), places[1]
         addresses = map(get_address, (records, parents, children, times, counts))
         ends = last == self._cells, recentres and self._recentres
+        count_work(CALL + len(records) * (last - places[0]) * self._cell_work)
         self._propagate(self._table_at, *addresses, times.shape[1], *places, len(records), *ends)
         return self.view(records)
 

@@ -19,7 +19,6 @@ from switchfit.engine.native.sizes import Order, Sizes
 from switchfit.engine.native.tracing.unsupported import Unsupported
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
-from switchfit.runtime.work_clock import stop_clock
 
 _one_at_a_time = threading.Lock()
 log = logging.getLogger("switchfit")
@@ -41,7 +40,7 @@ def compile_library(library: Structure, sizes: Sizes, orders: tuple[Order, ...],
 
     The log has the reason too.
     """
-    with _one_at_a_time, stop_clock():
+    with _one_at_a_time:
         return _program_of(library, sizes, orders, write)
 
 
