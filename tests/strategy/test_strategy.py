@@ -244,7 +244,7 @@ def test_a_budget_of_time_ends_the_search(monkeypatch):
         sf.estimate(thermostat(FAR), strategy="magic")
     for module in (search, stopping):
         monkeypatch.setattr(module, "is_doubted", lambda fit: True)
-    found = [sf.estimate(thermostat(tuple(TRUTH[:5]), sigma=0.01), time_budget=budget) for budget in (None, 0.2)]
+    found = [sf.estimate(thermostat(tuple(TRUTH[:5]), sigma=0.01), time_budget=budget) for budget in (None, 5.0)]
     assert [len(fit.steps) for fit in found] == [2, 3], "the beam finds nothing lower; seconds that are given are used"
 
 
