@@ -26,7 +26,7 @@ from switchfit.problem.jaxprs import find_read_entries, list_jaxprs
 from switchfit.problem.traced_constants import refuse_wrong_constants
 from switchfit.problem.validation.messages import join_names
 from switchfit.problem.validation.objects import find_misfit
-from switchfit.runtime.jax_internals import copy_literals, drop_unused, evaluate_jaxpr, forget_names
+from switchfit.runtime.jax_internals import copy_constants, copy_literals, drop_unused, evaluate_jaxpr, forget_names
 
 Array = jax.Array
 Shape = tuple[int, ...]
@@ -202,8 +202,7 @@ def _trace(call: Call, parameters: Mapping[str, Shape]) -> Function:
     jaxpr, is_read = drop_unused(closed.jaxpr, is_kept)
     for each in list_jaxprs(jaxpr):
         copy_literals(each)
-    consts = [np.array(const) if isinstance(const, np.ndarray) else const for const in closed.consts]
-    closed = type(closed)(forget_names(jaxpr), consts)
+    closed = type(closed)(forget_names(jaxpr), copy_constants(closed.consts))
     return Function(closed, tuple(compress(parameters, is_read[count:])))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from switchfit.runtime.jax_internals import find_traced_function, find_user_line
+from switchfit.runtime.jax_internals import evaluate_equation, find_traced_function, find_user_line
 
 SELECTIONS: dict[str, Callable[[Any, Any], Any]] = {
     "slice": lambda a, at: a[
@@ -63,8 +63,7 @@ def evaluate(equation: Any, operands: Sequence[Any]) -> list[Any]:
     equation : operation of a jaxpr
     operands : sequence
     """
-    made = equation.primitive.bind(*operands, **equation.primitive.get_bind_params(equation.params))
-    return list(made) if equation.primitive.multiple_results else [made]
+    return evaluate_equation(equation, operands)
 
 
 class Walk:

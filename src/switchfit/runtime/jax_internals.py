@@ -50,6 +50,15 @@ def evaluate_jaxpr(jaxpr: Jaxpr, consts: Sequence[Any], *given: Any) -> list[Any
     return jax.core.eval_jaxpr(jaxpr, consts, *given)
 
 
+def evaluate_equation(equation: Equation, operands: Sequence[Any]) -> list[Any]:
+    """Return the results of one operation, by its own rule for derivatives if it has one."""
+    # JAX 0.9 returns functions that go before the operands, and parameters; since 0.10 all are parameters.
+    found = equation.primitive.get_bind_params(equation.params)
+    functions, params = found if isinstance(found, tuple) else ((), found)
+    made = equation.primitive.bind(*functions, *operands, **params)
+    return list(made) if equation.primitive.multiple_results else [made]
+
+
 def drop_unused(jaxpr: Jaxpr, keeps_input: bool | Sequence[bool]) -> tuple[Jaxpr, list[bool]]:
     """Return a jaxpr without the operations that no result needs, and which of its inputs are left.
 
@@ -65,14 +74,24 @@ def forget_names(jaxpr: Jaxpr) -> Jaxpr:
     return jaxpr.replace(debug_info=jaxpr.debug_info.with_unknown_names())
 
 
+def copy_constants(consts: Sequence[Any]) -> list[Any]:
+    """Return the constants of a jaxpr, those in NumPy arrays as copies: JAX keeps references to the user's arrays."""
+    return [np.array(const) if isinstance(const, np.ndarray) else _copy_wrapped(const) for const in consts]
+
+
 def copy_literals(jaxpr: Jaxpr) -> None:
     """Copy the numbers in a jaxpr in place: JAX keeps references to the user's arrays without axes, which may change.
 
     Jaxprs inside it are not changed.
     """
     for atom in (*jaxpr.outvars, *(atom for equation in jaxpr.eqns for atom in equation.invars)):
-        if isinstance(atom, Literal) and isinstance(atom.val, np.ndarray):
-            atom.val = copy.deepcopy(atom.val)
+        if isinstance(atom, Literal):
+            atom.val = copy.deepcopy(atom.val) if isinstance(atom.val, np.ndarray) else _copy_wrapped(atom.val)
+
+
+def _copy_wrapped(value: Any) -> Any:
+    """Return a copy of a NumPy array in the object in which JAX 0.9 wraps it; anything else as it is."""
+    return copy.deepcopy(value) if isinstance(getattr(value, "val", None), np.ndarray) else value
 
 
 def find_traced_function(jaxpr: Jaxpr | ClosedJaxpr) -> tuple[str | None, str]:
