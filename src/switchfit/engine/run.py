@@ -10,8 +10,7 @@ from functools import cached_property
 from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments, build_common_arguments, put_on_mesh
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.corners.branches import Branches, find_branches, has_corners
-from switchfit.engine.corners.path import BranchPath
+from switchfit.engine.corners.branches import Branches, BranchPath, find_branches, has_corners
 from switchfit.problem.corners.times import find_corner_times
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, keep_with_problem

@@ -57,6 +57,7 @@ class Oracle:
         d = theta.size
         equalities, violation = self._no_equalities, 0.0
         if not self.problem.equalities:
+            # Copies: a caller that keeps theta, or writes to it, must not reach into the state.
             value = self.problem.evaluate(theta.copy(), side)
         else:
             units = 1.0 if self.units is None else self.units
@@ -70,6 +71,8 @@ class Oracle:
                 self.multipliers = self.multipliers * self.units
             equalities = Equalities(c / self.units, A / self.units[:, None])
             violation = algebra.norm(equalities.values)
+        # J, and what the step will need: a point where any of it is not finite is refused like one outside of the
+        # constraints.
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         # Without a Hessian the result has one of NaN; nothing but steepest descent goes on with it.
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian

@@ -251,6 +251,7 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
     point = state.point
     gradient, hessian = point.derivatives(point.reported_sides)
     curvature = state.curvature_at(problem, point.active)
+    # What kinks and constraints do at the point, for reports: a breakpoint at which no derivative jumps is none.
     held = np.flatnonzero(state.genuine_kinks)
     equalities = _list_equalities(oracle, point)
     missed = np.abs(point.plus.equalities.values) > MET / np.sqrt(max(len(equalities), 1))

@@ -122,6 +122,8 @@ class Integrator:
                 x = self._apply_reset(i - 1, ends[i], x)
             # Strictly inside: a knot at a transition is the end of the stretch already.
             inside = (self._stops > ends[i]) & (self._stops < ends[i + 1])
+            # Segment i: its reset map, then stretch by stretch between the knots of the input, then branch by branch
+            # (`_follow`).
             stops = np.concatenate([[ends[i]], self._stops[inside], [ends[i + 1]]])
             name = structure.mode_names[mode]
             is_explicit = not structure.implicit[mode] and name not in self._settings.implicit
@@ -137,6 +139,7 @@ class Integrator:
                     accepted, x = self._follow(Stretch(mode, start, end, x, is_explicit))
                     steps += accepted
                     if self._settings.watch is not None:
+                        # How many rows the mesh will have there: what implicit and explicit steps are compared by.
                         self._watch.mode.rows += _count_rows(np.concatenate([[start], *accepted]), self._coarse.times)
         return np.concatenate(steps)
 

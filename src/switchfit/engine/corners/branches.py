@@ -1,4 +1,4 @@
-"""The library of branches of modes with corners, and the structure in which crossings of corners are transitions.
+"""The branches of modes with corners: the path of a trajectory through them, the library of those that were met.
 
 With the crossings of a path as transitions, whose times follow from the state by a guard, the discretized system is
 smooth again: rows end at them. Programs are compiled for the library, which only grows.
@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.engine.corners.path import BranchPath
+from switchfit.arrays import FloatArray
 from switchfit.problem.corners.branches import Sides, find_corners
 from switchfit.problem.functions import Function
 from switchfit.problem.structure import Structure
@@ -24,6 +24,23 @@ programs take ten seconds to compile above the first number, which holds unless 
 
 FEW_CORNERS = 2
 """Largest number of corners of a mode for which the ends of a branch are compiled with it, passed or not."""
+
+
+class BranchPath(NamedTuple):
+    """The path of a trajectory: in which branches it runs, and when it crosses from one to the next.
+
+    Attributes
+    ----------
+    sides : for each segment the sides of its branches, one after the other
+    ends : for each segment which end of a branch each crossing is; -1 at a known time, as where an input jumps
+    times : (K,), of all crossings
+    scales : (K,), the largest size so far of the function that is zero at each
+    """
+
+    sides: tuple[tuple[Sides, ...], ...]
+    ends: tuple[tuple[int, ...], ...]
+    times: FloatArray
+    scales: FloatArray
 
 
 class Branches:

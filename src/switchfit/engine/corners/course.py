@@ -16,8 +16,7 @@ from switchfit.arrays import BoolArray, FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import read_parameters
 from switchfit.engine.corners.branch_functions import trace_for_numpy
-from switchfit.engine.corners.branches import Branches
-from switchfit.engine.corners.path import BranchPath
+from switchfit.engine.corners.branches import Branches, BranchPath
 from switchfit.problem.corners.branches import Corners, Sides, find_corners
 from switchfit.problem.functions import Function
 from switchfit.problem.structure import Structure

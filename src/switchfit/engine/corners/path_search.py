@@ -5,9 +5,8 @@ from __future__ import annotations
 from switchfit.arrays import FloatArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive.integrator import Integrator, SolveSettings
-from switchfit.engine.corners.branches import Branches
+from switchfit.engine.corners.branches import Branches, BranchPath
 from switchfit.engine.corners.course import BranchError, Course, SteepError
-from switchfit.engine.corners.path import BranchPath
 from switchfit.engine.run import Run
 
 

@@ -28,9 +28,8 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive.integrator import SolveSettings
 from switchfit.engine.corners.branch_functions import are_equal
-from switchfit.engine.corners.branches import Branches
+from switchfit.engine.corners.branches import Branches, BranchPath
 from switchfit.engine.corners.course import Course, find_dips
-from switchfit.engine.corners.path import BranchPath
 from switchfit.engine.corners.path_search import find_path
 from switchfit.engine.evaluation import DenseEvaluation, Engine, Evaluation, Matrix, build_undefined_evaluation
 from switchfit.engine.jax.jax_engine import JaxEngine
