@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import accumulate
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -195,7 +195,7 @@ class Model:
 
     def reset(self, i: int) -> Callable[[Array, Array, Array], Array]:
         """Return the reset map R_i(t, x, p) of transition i, which must have one."""
-        function: Any = self.structure.reset_maps[i]
+        function = cast(Function, self.structure.reset_maps[i])
         return lambda t, x, p: function(t, x, self.parameters(p))
 
     def terminal_constraint(self, x: Array, p: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,8 @@ class Hypotheses(NamedTuple):
     gradients, matrices : (B, D), (B, D, D): g and the Gauss-Newton matrix H
     moved : (B, D), how far the point of linearisation is from the births on the grid and from the first p
     states, tangents : (B, n), (B, n, D)
-    records : Any
-        What the engine needs to go on.
+    records : (B, size)
+        Memory of the engine, with all of the above in it and what it needs to go on; empty where none can.
     """
 
     scores: FloatArray
@@ -44,7 +44,7 @@ class Hypotheses(NamedTuple):
     moved: FloatArray
     states: FloatArray
     tangents: FloatArray
-    records: Any = None
+    records: FloatArray = np.zeros((0, 0))
 
     def take(self, chosen: NDArray[np.int64]) -> Hypotheses:
         """Return some of them, with which no engine can go on."""
