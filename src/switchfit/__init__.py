@@ -6,7 +6,7 @@ NumPy, so that the command line answers ``--help`` at once. Type checkers read t
 
 from importlib import import_module as _import_module
 
-from switchfit.runtime import compile_small_loops_whole as _compile_small_loops_whole
+from switchfit.runtime.xla_flags import compile_small_loops_whole as _compile_small_loops_whole
 
 _compile_small_loops_whole()  # now: XLA reads its flags when it first compiles, in whatever part of the program
 

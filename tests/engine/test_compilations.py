@@ -21,7 +21,7 @@ from switchfit.engine.jax.programs import call_model, derivatives, simulate_rows
 from switchfit.engine.native.program_cache import _program_of, drop_programs
 from switchfit.meshes.evaluator import evaluator_of
 from switchfit.problem import functions
-from switchfit.runtime import SMALL_LOOPS, compile_small_loops_whole
+from switchfit.runtime.xla_flags import SMALL_LOOPS, compile_small_loops_whole
 
 # Nothing is compiled anew
 

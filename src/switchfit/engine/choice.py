@@ -1,4 +1,7 @@
-"""Choose the engine that evaluates an experiment: machine code if possible, else JAX, with the reason."""
+"""Choose the engine that evaluates an experiment: machine code if possible, else JAX, with the reason.
+
+All engines offer the methods of `JaxEngine`, and their property `engine` says which one it is and why.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Breakpoints: values of coordinates at which the derivatives of the cost may jump."""
+"""Breakpoints: values of coordinates at which the derivatives of the cost may jump.
+
+Of a transition time these are the nodes of the mesh: all samples and knots, at most of which J has no visible kink. So
+they are no bounds of steps: a step that fails is cut at them (`line_search`), and a point that ends on one has two
+one-sided derivatives (`oracle`).
+"""
 
 from __future__ import annotations
 

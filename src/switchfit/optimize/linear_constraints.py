@@ -1,4 +1,8 @@
-"""Linear inequalities and bounds, each with a name for messages."""
+"""Linear inequalities and bounds, each with a name for messages.
+
+In a fit the rows are the order of the transition times with their shortest durations, and what users bound beside the
+unknowns themselves. All iterates satisfy them; `feasibility` says how exactly.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The minimization problem: the caller's function, linear constraints, breakpoints and settings."""
+"""The minimization problem: the caller's function, linear constraints, breakpoints and settings.
+
+It is all that the optimizer knows of its caller: theta is a vector, J a function that returns numbers.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""State of the minimization between two iterations: the best point so far, and scales, radius and penalty."""
+"""State of the minimization between two iterations: the best point so far, and scales, radius and penalty.
+
+A `State` is never changed: one iteration of `sqp` returns the next one, by `State.advance` from an `Accepted` step. The
+scales are the largest values seen, by which rounding is measured; a restart forgets them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Progress of a long run, on the terminal or in a notebook."""
+"""Progress of a long run, on the terminal or in a notebook.
+
+A function that may take long opens a line (`show_line`, `show_progress`); what is done inside it says how far it is
+(`show_detail`) without knowing whether anybody looks, or whether there is a line at all.
+"""
 
 from __future__ import annotations
 
