@@ -1,7 +1,7 @@
 """Write files atomically, and explain why a file cannot be read.
 
-What is written as a whole goes through `write_atomically`: whoever reads it finds the old or the new content, also after
-a kill or on a full disk.
+What is written as a whole goes through `write_atomically`: whoever reads it finds the old or the new content, also
+after a kill or on a full disk.
 """
 
 from __future__ import annotations
