@@ -22,7 +22,8 @@ from benchmarks.starts.case import Case, Sampled
 from benchmarks.starts.end import End
 from switchfit.estimation.local_fit import REFINEMENTS
 from switchfit.meshes.evaluator import Evaluator
-from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, judge_meshes, refine_meshes
+from switchfit.meshes.halving import refine_meshes
+from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, judge_meshes
 from switchfit.uncertainty.sample_derivatives import collect_sample_derivatives
 from switchfit.uncertainty.sensitivity import Sensitivity
 

@@ -14,6 +14,7 @@ from support.thermostats import FAR, HEATER, TIMES, TRUTH, temperatures, thermos
 from switchfit.engine.corners.split_engine import SplitEngine
 from switchfit.fit.search_record import Step
 from switchfit.meshes.evaluator import Evaluator
+from switchfit.meshes.halving import halve_rows
 from switchfit.optimize import Status
 from switchfit.runtime import work
 from switchfit.strategy import beam, choice, many_starts, other_minima, search, stopping
@@ -273,7 +274,7 @@ def test_rows_beside_transitions_are_halved_too():
     """A transition in the second half of a cell leaves the row behind it as it is where cells are halved."""
     evaluator = Evaluator(thermostat(FAR))
     theta = np.array([0.4375, 1.9, 3.4, 6.7, 8.1, 1.0, 0.8])
-    fine = evaluator.halve_rows(theta).meshes[0].times
+    fine = halve_rows(evaluator, theta).meshes[0].times
     for tau in theta[:5]:
         coarse = evaluator.meshes[0].times
         behind = coarse[coarse > tau][0] - tau

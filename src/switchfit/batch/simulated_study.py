@@ -20,7 +20,8 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.local_fit import REFINEMENTS
 from switchfit.fit.comparison import compare
 from switchfit.meshes.evaluator import Evaluator
-from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, ORDER_OF_METHODS, cost_error
+from switchfit.meshes.halving import ORDER_OF_METHODS, halve_rows
+from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, cost_error
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation.arrays import as_array
@@ -55,7 +56,7 @@ def build_study(
 def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
     """Return what data would be without noise."""
     found: Values = {}
-    comparisons = compare(Evaluator(problem, truth).halved, truth)[1]
+    comparisons = compare(Evaluator(problem, truth).divide(2), truth)[1]
     for e, (experiment, run) in enumerate(zip(problem.experiments, comparisons, strict=True)):
         places = [k for k, item in enumerate(experiment.data) if isinstance(item, Measurements)]
         if not places or any(comparison.kind != "measurements" for comparison in run):
@@ -96,7 +97,7 @@ def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tup
     thetas = (truth,) if np.array_equal(start, truth) else (start, truth)
     for attempt in range(REFINEMENTS + 1):
         evaluator = Evaluator(problem, *thetas, finer=finer)
-        fine = evaluator.halve_rows(truth).cost(truth)
+        fine = halve_rows(evaluator, truth).cost(truth)
         # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
         error = cost_error(problem, fine, evaluator(truth).cost, evaluator(start).cost)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)

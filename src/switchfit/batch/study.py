@@ -34,6 +34,7 @@ from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.data_variation import measure_variation
 from switchfit.fit.statistics import count_priors, measure_variance
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.halving import halve_rows
 from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, cost_error
 from switchfit.optimize import Status
 from switchfit.problem.problem import Problem
@@ -55,7 +56,7 @@ def _is_resolved(problem: Problem, meshes: Sequence[Mesh] | None, theta: FloatAr
     `cost` is J where it ended on meshes of its own; on shared ones, it is found anew, as what failed may have none.
     """
     evaluator = evaluator_of(problem) if meshes is None else Evaluator(problem, meshes=meshes)
-    fine = evaluator.halve_rows(theta).cost(theta)
+    fine = halve_rows(evaluator, theta).cost(theta)
     error = cost_error(problem, fine, cost if meshes is None else evaluator.cost(theta), 0.0)
     return error <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
 

@@ -11,7 +11,7 @@ transition times.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -22,7 +22,7 @@ import numpy as np
 from switchfit.arrays import ArrayModule, FloatArray, IntArray, Traced
 from switchfit.discretization.stiffness import Stiffness
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.padding import pad_length
+from switchfit.problem.padding import choose_common_lengths, pad_length
 
 SHARP = 1e-3
 """Part of the longest cell of a mesh below which its shortest one says that the model is sharp: 1e-6 to 1e-4 where
@@ -186,6 +186,16 @@ def _grade_nodes(nodes: FloatArray, step_times: FloatArray, steps: FloatArray, p
     cut = np.repeat(np.arange(len(pieces)), pieces - 1)
     turn = np.arange(len(cut)) - np.repeat(np.cumsum(pieces - 1) - (pieces - 1), pieces - 1) + 1
     return np.interp(cut + turn / pieces[cut], position, times)
+
+
+def pad_meshes(meshes: Sequence[Mesh], groups: Iterable[Sequence[int]]) -> list[Mesh]:
+    """Return the meshes of all experiments, in each group of equal structure padded to lengths that they share."""
+    padded = list(meshes)
+    for group in groups if len(padded) > 1 else ():
+        lengths = choose_common_lengths([padded[e].cells for e in group])
+        for e, length in zip(group, lengths, strict=True):
+            padded[e] = padded[e] if len(group) == 1 else padded[e].pad_to(length)
+    return padded
 
 
 class MeshRows(NamedTuple):

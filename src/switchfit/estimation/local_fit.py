@@ -20,7 +20,8 @@ from switchfit.estimation.insignificance import drop_noise_of_times, is_within_e
 from switchfit.fit.minimization import minimize_cost
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.meshes.follower import Follower
-from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, ORDER_OF_METHODS, judge_meshes, refine_meshes
+from switchfit.meshes.halving import ORDER_OF_METHODS, refine_meshes, stabilize
+from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, judge_meshes
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.minimization_problem import HessianKind
 from switchfit.problem.problem import Problem, keep_with_problem
@@ -98,7 +99,7 @@ def fit_locally(
         if attempt == REFINEMENTS or result.status is Status.INTERRUPTED:
             break
         failed = not result.status.successful or excess > 2**ORDER_OF_METHODS
-        stable = evaluator.stabilize(first, theta) if failed else None
+        stable = stabilize(evaluator, first, theta) if failed else None
         if stable is None and (result.status in STOPPED or not excess > 1):
             break
         try:

@@ -2,8 +2,7 @@
 
 It combines the experiments: the engine of each evaluates J in the experiment's own unknowns, and the sum is in theta,
 as a full matrix or in the shape of an arrow. Priors are added here. On its meshes J is one smooth function between
-kinks, since a mesh does not change with theta; other meshes are another evaluator (`divide`, `halve_rows`,
-`stabilize`).
+kinks, since a mesh does not change with theta; other meshes are another evaluator (`halving`).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.mesh import Mesh, pad_meshes
 from switchfit.discretization.stiffness import Stiffness
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.corners.split_engine import SmoothEngine, SplitEngine
@@ -26,12 +25,11 @@ from switchfit.engine.evaluation import DenseEvaluation, Engine, Evaluation, Mat
 from switchfit.engine.native.native_engine import NativeEngine
 from switchfit.engine.run import Run, runs_of
 from switchfit.engine.simulation import Simulation
-from switchfit.meshes.refinement import refine_if_unstable, refine_mesh_of_run
+from switchfit.meshes.refinement import refine_mesh_of_run
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.optimize.breakpoints import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
 from switchfit.problem.functions import use_float64
-from switchfit.problem.padding import choose_common_lengths
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.structure import Structure
@@ -56,6 +54,15 @@ class Evaluator:
         Data and constants on these meshes, where they are not the problem's own.
     finer : float
         Multiplies the number of cells of refined meshes.
+
+    Attributes
+    ----------
+    meshes : list of Mesh
+    arguments : list of Arguments
+    engines : list of Engine
+        One for each experiment.
+    halved : Evaluator or None
+        The same problem on halved cells, once `halve_cells` has been asked for it.
     """
 
     def __init__(
@@ -68,13 +75,14 @@ class Evaluator:
     ) -> None:
         self.problem = problem
         if meshes is None:
-            points = thetas or (problem.initial_theta,)
-            meshes = [refine_mesh_of_run(run, *points, finer=finer) for run in self.runs]
+            meshes = [refine_mesh_of_run(run, *(thetas or (problem.initial_theta,)), finer=finer) for run in self.runs]
         self.meshes = list(meshes)
         if arguments is None:
-            arguments = [run.build_arguments(mesh) for run, mesh in zip(self.runs, self._pad_meshes(), strict=True)]
+            padded = pad_meshes(self.meshes, problem.alike)
+            arguments = [run.build_arguments(mesh) for run, mesh in zip(self.runs, padded, strict=True)]
         self.arguments = list(arguments)
         self.engines = list(map(engine_of, self.runs, self.arguments, self.meshes))
+        self.halved: Evaluator | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """How it is copied and pickled: on the same meshes, with programs of its own."""
@@ -85,15 +93,6 @@ class Evaluator:
         """The experiments, as all evaluators of the problem share them."""
         return runs_of(self.problem)
 
-    def _pad_meshes(self) -> list[Mesh]:
-        """Return the meshes; those of experiments with equal structure are padded to common lengths."""
-        padded = list(self.meshes)
-        for group in self.problem.alike if len(padded) > 1 else ():
-            lengths = choose_common_lengths([padded[e].cells for e in group])
-            for e, length in zip(group, lengths, strict=True):
-                padded[e] = padded[e] if len(group) == 1 else padded[e].pad_to(length)
-        return padded
-
     def divide(self, parts: int) -> Evaluator:
         """Return the same problem with every cell of its meshes cut into equal parts."""
         return Evaluator(self.problem, meshes=[mesh.divide(parts) for mesh in self.meshes])
@@ -101,27 +100,6 @@ class Evaluator:
     @cached_property
     def _priors(self) -> PriorTerms | None:
         return self.problem.unknowns.priors if self.problem.unknowns.priors.any else None
-
-    @cached_property
-    def halved(self) -> Evaluator:
-        """The same problem with every cell of its meshes cut in two."""
-        return self.divide(2)
-
-    def halve_rows(self, theta: FloatArray) -> Evaluator:
-        """Return the same problem with every step at theta cut in two, to estimate the integration error."""
-        each = zip(self.meshes, self._vectors(theta), strict=True)
-        return Evaluator(self.problem, meshes=[mesh.halve_rows(tau) for mesh, (tau, _) in each])
-
-    def stabilize(self, *thetas: FloatArray) -> Evaluator | None:
-        """Return the same problem with implicit steps where explicit ones are unstable near the last of some thetas;
-        None if all are stable.
-
-        A fit cannot go beyond a theta at which the steps of its mesh become unstable: J is not finite there.
-        """
-        found = [refine_if_unstable(run, mesh, *thetas) for run, mesh in zip(self.runs, self.meshes, strict=True)]
-        if not any(found):
-            return None
-        return Evaluator(self.problem, meshes=[new or mesh for new, mesh in zip(found, self.meshes, strict=True)])
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact", arrow: bool = False
@@ -140,7 +118,8 @@ class Evaluator:
         parts = np.split(multipliers, np.cumsum(self.problem.constraint_counts)[:-1])
         each = zip(self.engines, self._vectors(theta), parts, strict=True)
         results = [engine.constrained(*at, side, own) for engine, at, own in each]
-        return self._add_priors(self._add_runs(results, len(theta)), theta)
+        whole = self._add_runs(results, len(theta))
+        return self._add_priors(whole, theta)
 
     def _add_runs(self, results: list[Evaluation[FloatArray]], d: int, arrow: bool = False) -> Evaluation[Any]:
         """Return the sum of the evaluations of all experiments, which are in their own unknowns, in theta (d,)."""

@@ -10,7 +10,8 @@ divided by a scale of that output:
   and of the states, nor on how long the run continues after the states have settled. A constraint in which no state
   varies has an absolute error.
 
-By how much the error is above `LARGEST_INTEGRATION_ERROR` says which finer meshes come next (`refine_meshes`).
+By how much the error is above `LARGEST_INTEGRATION_ERROR` says which finer meshes come next
+(`switchfit.meshes.halving.refine_meshes`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ import numpy as np
 from switchfit.arrays import FloatArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import Model, list_transition_functions
+from switchfit.engine.simulation import Simulation
 from switchfit.meshes.evaluator import Evaluator
+from switchfit.meshes.halving import halve_cells, halve_rows
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
@@ -35,9 +38,6 @@ from switchfit.runtime.cache import use_compilation_cache
 LARGEST_INTEGRATION_ERROR = 1e-8
 """Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.fit.accuracy`) above
 which the mesh is refined again, unless rtol allows more."""
-
-ORDER_OF_METHODS = 5
-"""Order of both integrators, and of the decrease of their error as steps are divided."""
 
 PERFECT_FIT = 1e-3
 """If J has fallen below this part of its first value, the integration error is relative to that part, since a cost that
@@ -71,28 +71,20 @@ def judge_meshes(
     """
     problem = evaluator.problem
     outputs = ("J", *problem.constraint_names)
-    for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(theta))[not by_cells :]:
-        fine = halve()
+    for halve in (halve_cells, partial(halve_rows, theta=theta))[not by_cells :]:
+        fine = halve(evaluator)
         fine_cost = fine.cost(theta)
-        errors = [cost_error(problem, fine_cost, cost, first_cost), *constraint_errors(fine, theta, constraints)]
+        # The errors of constraints are computed from the states alone, so that nothing is compiled for these meshes.
+        states = fine.simulate(theta) if problem.constraint_names else []
+        errors = [
+            cost_error(problem, fine_cost, cost, first_cost),
+            *_measure_constraint_errors(fine, theta, states, constraints),
+        ]
         worst = int(np.argmax(errors))  # NaN counts as the largest
         error, output = float(errors[worst]), outputs[worst]
         if error > max(LARGEST_INTEGRATION_ERROR, problem.rtol):
             break
     return fine, fine_cost, error, output
-
-
-def refine_meshes(
-    evaluator: Evaluator, start: FloatArray, theta: FloatArray, excess: float, *, first: bool
-) -> Evaluator:
-    """Return the problem on finer meshes: halved, or, if that is not enough, refined at the start and at theta.
-
-    A mode that has become active in another part of the horizon may meet cells there that are far too long for it.
-    The first meshes have their cells halved, later ones their rows at theta.
-    """
-    if excess <= 2**ORDER_OF_METHODS:
-        return evaluator.halved if first else evaluator.halve_rows(theta)
-    return Evaluator(evaluator.problem, start, theta)
 
 
 def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: float) -> float:
@@ -101,24 +93,26 @@ def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: floa
     return abs(fine_cost - cost) / size
 
 
-def constraint_errors(fine: Evaluator, theta: FloatArray, constraints: Sequence[float]) -> FloatArray:
+def _measure_constraint_errors(
+    fine: Evaluator, theta: FloatArray, simulations: Sequence[Simulation], constraints: Sequence[float]
+) -> FloatArray:
     """Return the changes of the guards and terminal constraints at theta by halving all steps, by their scales: (m,).
-
-    They are computed from the states alone, so that nothing is compiled for the meshes of `fine`.
 
     Parameters
     ----------
     fine : Evaluator
         On the meshes of the fit with every step halved.
     theta : (d,)
+    simulations : sequence of Simulation
+        Of `fine` at theta.
     constraints : (m,)
         On the meshes of the fit.
     """
     problem = fine.problem
-    if not problem.constraint_names:
+    if not simulations:
         return np.zeros(0)
     values, scales = [np.zeros(0)], [np.zeros(0)]
-    given = zip(problem.structures, fine.arguments, fine.simulate(theta), strict=True)
+    given = zip(problem.structures, fine.arguments, simulations, strict=True)
     for e, (structure, arguments, simulation) in enumerate(given):
         if problem.constraint_counts[e]:
             tau, p = problem.vectors(theta, e)

@@ -51,7 +51,8 @@ def refine_mesh_of_run(
         If a mode returns a value that is not finite, or the trajectory cannot be integrated to its end.
     """
     choice = ImplicitModes(stiffness)
-    return run.coarse.refine(_solve_at(run, thetas, choice, most), choice.stiffness, choice.has_limits, finer)
+    solutions = _solve_at(run, thetas, choice, most)
+    return run.coarse.refine(solutions, choice.stiffness, choice.has_limits, finer)
 
 
 def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:

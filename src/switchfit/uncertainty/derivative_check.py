@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from switchfit.arrays import FloatArray
 from switchfit.engine.evaluation import Evaluation
 from switchfit.meshes.evaluator import Evaluator, evaluator_of, is_covered_by_paper
+from switchfit.meshes.halving import halve_cells
 from switchfit.problem.comparisons import find_bends
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation.objects import as_flag, as_instance
@@ -204,7 +205,7 @@ def measure_closing_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float,
     gaps = measure_derivative_gap(evaluator, theta)
     if not max(gaps) > LARGEST_GAP or evaluator.takes_implicit_steps:
         return gaps
-    return min(gaps, measure_derivative_gap(evaluator.halved, theta), key=max)
+    return min(gaps, measure_derivative_gap(halve_cells(evaluator), theta), key=max)
 
 
 def _measure_gap(a: FloatArray, b: FloatArray, floor: float) -> float:

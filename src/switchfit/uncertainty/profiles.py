@@ -37,6 +37,7 @@ from switchfit.fit.minimization import minimize_cost
 from switchfit.fit.result import Fit
 from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.follower import Follower
+from switchfit.meshes.halving import halve_cells
 from switchfit.optimize import Status
 from switchfit.optimize.least_distance import nearest_feasible
 from switchfit.problem.validation.arrays import as_level
@@ -112,7 +113,7 @@ class Profile(Tabular, Displayed):
         runs = [e for e, place in list_transitions(evaluator.problem) if place == k]  # that of a transition time
         self.sample_times = list_sample_times(evaluator.problem, fit.theta, runs[0]) if runs else np.zeros(0)
         self._constraints, self._scale = evaluator.problem.constraints, fit.variance_scale
-        self._follower = Follower(evaluator.halved)
+        self._follower = Follower(halve_cells(evaluator))
         self._starts = {side: self._describe(fit.theta, self._follower(fit.theta, side), True) for side in (-1, 1)}
         self._centre = self._starts[1]
         self.points, self.fits = [self._centre], 0

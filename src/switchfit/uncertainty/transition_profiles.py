@@ -13,6 +13,7 @@ from switchfit.arrays import FloatArray
 from switchfit.fit.result import Fit
 from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.follower import Follower
+from switchfit.meshes.halving import halve_cells
 from switchfit.problem.problem import Problem
 from switchfit.uncertainty.density_intervals import HIGHEST_RISE, list_resets
 from switchfit.uncertainty.profile_pieces import NUMBERS_OF_PIECE
@@ -70,7 +71,7 @@ def trace_profiles(
             places.append(k)
     if not ways:
         return nothing
-    walks, follower = join_walks(ways), Follower(evaluator.halved)  # its meshes suit the estimate alone
+    walks, follower = join_walks(ways), Follower(halve_cells(evaluator))  # its meshes suit the estimate alone
 
     def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
         found = [follower(theta, side) for theta, side in zip(thetas, walks.side[which].tolist(), strict=True)]
