@@ -113,6 +113,7 @@ class Model:
         """Return the sum of all running costs in a mode inside one cell, reference signals included; 0 after a free
         tf.
         """
+        # Behind a free tf nothing is measured: the rest adds nothing to J, whatever the state does there.
         if self.structure.is_rest(mode):
             return lambda t, x, p: jnp.zeros(())
 
@@ -200,6 +201,7 @@ class Model:
 
     def terminal_constraint(self, x: Array, p: Array) -> Array:
         """Return all terminal constraints, concatenated: (m,)."""
+        # In the order of `problem.constraint_names`, behind the guards.
         parts = [psi(x, self.parameters(p)) for psi in self.structure.terminal_constraints]
         return jnp.concatenate([part.reshape(-1) for part in parts])
 

@@ -50,6 +50,7 @@ def butcher() -> Tableau:
     a[3, :3] = [0, -1 / 2, 1]
     a[4, :4] = [3 / 16, 0, 0, 9 / 16]
     a[5, :5] = [-3 / 7, 2 / 7, 12 / 7, -12 / 7, 8 / 7]
+    # b is Boole's rule at c = 0, 1/4, 1/2, 3/4, 1; the c_j are the sums of the rows of a.
     return Tableau(a, np.array([7, 0, 32, 12, 32, 7]) / 90, a.sum(1))
 
 

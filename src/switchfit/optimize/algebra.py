@@ -49,12 +49,11 @@ ARMIJO_DESCENT = 0.4
 
 #: Differences of costs below this part of the cost say nothing: where residuals are small beside what is measured, the
 #: rounding of a sum of their squares is a few hundred units, and a search by costs takes many short steps at the end.
-#: Twelve such fits take 188 evaluations, 202 with 32 units. With 1e-10 in place of 1e-12, steepest descent takes a
-#: quarter more on the bed, for then searches end by the gradient that costs would end.
+#: Twelve such fits take 188 evaluations, 202 with 32 units in place of 4096. With 1e-10, steepest descent takes a
+#: quarter more on the bed.
 COST_NOISE = 4096 * EPS
 
-#: A step below this part of the unknowns' size is negligible: Newton's step before it was about its root, 1e-5, so that
-#: nothing is left to be gained, and the unknowns have ten digits.
+#: A step below this part of the unknowns' size is negligible: Newton's next one would be of the size of its square.
 NEGLIGIBLE_STEP = 1e-10
 
 #: Iterations spent on making the last step negligible once the optimality is below the tolerance: the tolerance of a

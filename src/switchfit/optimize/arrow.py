@@ -57,6 +57,8 @@ class ArrowLayout:
     def of(cls, size: int, places: Sequence[IntArray]) -> ArrowLayout:
         """Return the layout of runs, each of which depends on the unknowns at the given places."""
         used = [np.unique(where[where >= 0]) for where in places]
+        # An unknown that one run alone depends on is its own; one that no run depends on counts as shared, with a row
+        # of 0.
         count = np.bincount(np.concatenate(used), minlength=size)
         alone = [where[count[where] == 1] for where in used]
         own = np.full((len(used), max(map(len, alone))), size, dtype=np.intp)

@@ -149,7 +149,7 @@ def _locate_rise(line: _Line) -> tuple[_Place, _Place]:
             break
         high = there
     # Bisection between a place where J falls and one where it has risen, until the two differ by rounding, or J is
-    # smooth between them: a smooth rise is none that has a place.
+    # smooth between them: a smooth rise is at no place in particular.
     while high.fraction - low.fraction > max(LOCATED * high.fraction, SHORTEST):
         if high.cost < np.inf and not line.jumps(low, high) and not line.bends(low, high):
             break

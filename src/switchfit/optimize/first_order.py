@@ -126,9 +126,9 @@ def _choices(sides: IntArray, concave: BoolArray, normals: FloatArray) -> Iterat
     extreme directions move a group of them, all to one side.
     """
     yield sides
-    # A concave kink: J falls to both sides of it, as where a transition passes a sample that neither mode explains. The
-    # rate J' is not convex then, and a descent may exist for one combination of sides alone: two times in order, one
-    # of which would go right and the other left, are blocked by their order, and descend together to the right.
+    # At a concave kink J falls to both sides. The rate J' is not convex then, and a descent may exist for one
+    # combination of sides alone: two times in order, one of which would go right and the other left, are blocked by
+    # their order, and descend together to the right.
     coupled = np.flatnonzero(concave & np.any(normals != 0.0, axis=0))
     few = coupled.size <= MANY_CONCAVE_KINKS
     for choice in product((1, -1), repeat=coupled.size) if few else [(1,), (-1,)]:

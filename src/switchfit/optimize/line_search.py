@@ -53,7 +53,7 @@ def search(oracle: Oracle, state: State, direction: SearchDirection) -> Accepted
         return _search_in_region(oracle, state, direction)
     if direction.descends:
         return _descend(oracle, state, direction)
-    # The full step goes across breakpoints: beside a minimum far from the start a step passes hundreds of samples,
+    # The full step goes across breakpoints: on the way to a minimum that is far away it passes hundreds of samples,
     # whose kinks are small beside the curvature of the whole. Piece by piece a fit would take an iteration a sample.
     alpha, crossing, k = 1.0, problem.breakpoints.count_crossed(theta, direction.step) > 0, 0
     while k < MAX_BACKTRACKS and not _is_hopeless(state, direction, k, alpha):

@@ -104,6 +104,7 @@ class Point:
 
     def find_jumps(self, least: FloatArray | float) -> BoolArray:
         """Return which derivatives jump upwards at a breakpoint here by more than this: (d,)."""
+        # Upwards: a convex kink, which holds its coordinate. A derivative that jumps downwards holds nothing.
         kink = np.zeros(self.theta.size, dtype=bool) if self.kink is None else self.kink
         return np.asarray(kink & (self.plus.gradient - self.minus.gradient > least))
 

@@ -62,6 +62,7 @@ class TracedBreakpoints(NamedTuple):
         """Return the largest number of breakpoints strictly between two points in one coordinate."""
         below, up_to = self._rank(theta)
         below_to, up_to_to = self._rank(to)
+        # Points below the end less those below or on the start: strictly inside a step to the right; or to the left.
         return jnp.max(jnp.maximum(below_to - up_to, below - up_to_to), initial=0)
 
     def piece(self, theta: Traced, constraints: TracedConstraints) -> tuple[Traced, Traced]:
@@ -102,6 +103,7 @@ def move_traced(constraints: TracedConstraints, breakpoints: TracedBreakpoints, 
 
     moved = breakpoints.snap(theta + step, theta, step, jnp.broadcast_to(constraints.size, theta.shape))
     moved = jnp.clip(moved, constraints.lower, constraints.upper)
+    # All rows in turn, once; `feasibility` goes round a few times, and only where rows are near.
     rows = constraints.b.shape[0]
     if not rows:
         return moved
