@@ -32,7 +32,5 @@ def find_path(
         except BranchError:
             pass
         branches.add(run.structure, course.path)
-        # A path that was found with all of its branches compiled is the one that evaluations take: a Python solve
-        # before has other steps.
         if steps is not None and branches.count == count:
             return steps, course.path
