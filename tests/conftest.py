@@ -11,8 +11,8 @@ import pytest
 from hypothesis import settings
 
 import switchfit as sf
+from switchfit.batch import batch
 from switchfit.batch import layout as batch_layout
-from switchfit.batch import programs
 from switchfit.engine.native import program_cache
 from switchfit.engine.native.llvm import compilation
 from switchfit.engine.native.program_cache import drop_programs
@@ -132,7 +132,7 @@ def fits_one_by_one():
         raise ValueError("error calling callback: none was called")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(programs, "minimize_fits", refuse)
+        patch.setattr(batch, "minimize_fits", refuse)
         patch.setattr(batch_layout, "runs_natively", lambda *given: False)  # evaluations are done one by one too
         yield
 

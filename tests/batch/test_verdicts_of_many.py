@@ -181,6 +181,6 @@ def test_a_folder_gives_the_same_verdict_and_intervals_unless_it_is_of_another_f
     assert again.verdict == first.verdict
     np.testing.assert_array_equal(again.levels, first.levels)
     np.testing.assert_array_equal(again.confidence_intervals(), first.confidence_intervals())
-    monkeypatch.setattr("switchfit.batch.study.CHUNK_FORMAT", "fits 1")
+    monkeypatch.setattr("switchfit.batch.logs.CHUNK_FORMAT", "fits 1")
     with pytest.raises(ValueError, match="holds the results of another run"):
         sf.estimate_many(problems, folder=tmp_path)

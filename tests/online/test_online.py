@@ -522,7 +522,7 @@ def test_a_parameter_with_a_new_value_is_joined_to_its_old_one(variance):
 
 def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
     """Maxima of 20 s of alarms at the rate exp(-(h - 5) / 2) / s: for one an hour, h = 5 + 2 log(3600)."""
-    from switchfit.online import samples
+    from switchfit.online import calibration
 
     rng = np.random.default_rng(0)
     drawn = iter(5 + 2 * (np.log(20) - np.log(rng.exponential(size=4000))))
@@ -532,7 +532,7 @@ def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
 
     quiet = SimpleNamespace(reset=lambda: None, update=update)
     monkeypatch.setattr(sf.OnlineEstimator, "build_like", lambda online, problem, threshold: quiet)
-    monkeypatch.setattr(samples, "list_updates", lambda noisy: [(0.0, {})])
+    monkeypatch.setattr(calibration, "list_updates", lambda noisy: [(0.0, {})])
     found = sf.calibrate(sf.OnlineEstimator(problem), 1 / 3600, runs=4000)
     assert found.threshold == pytest.approx(5 + 2 * np.log(3600), abs=0.5)  # 1.8 more without the factor
 

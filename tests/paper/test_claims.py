@@ -147,7 +147,7 @@ def test_an_interrupted_run_goes_on_with_what_is_missing_and_one_part_alone_leav
         return Part(f"part {name}", lambda quick, say: say("begins") or compute(), list_rows=list_rows)
 
     first, second = Mock(side_effect=[{"value": 1}, {"value": 3}]), Mock(side_effect=[KeyboardInterrupt, {"value": 2}])
-    monkeypatch.setattr("switchfit.paper.parts.PARTS", {"lti": build("lti", first), "noise": build("noise", second)})
+    monkeypatch.setattr("switchfit.paper.runner.PARTS", {"lti": build("lti", first), "noise": build("noise", second)})
     said = []
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, quick=True, say=said.append)

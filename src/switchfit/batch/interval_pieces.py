@@ -48,12 +48,12 @@ def list_places(problem: Problem) -> NDArray[np.intp]:
 
 
 def make_no_pieces(problem: Problem, count: int) -> FloatArray:
-    """Return the pieces of fits none of which has a sample near: (R, T, 2, `MOST_KEPT`, 5) of NaN."""
+    """Return the pieces of fits none of which has a sample near: (R, T, 2, `MOST_PIECES_OF_SIDE`, 5) of NaN."""
     return np.full((count, len(list_places(problem)), 2, MOST_PIECES_OF_SIDE, profile_pieces.NUMBERS_OF_PIECE), np.nan)
 
 
 def trace_chunk(chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], batch: Batch) -> FloatArray:
-    """Return the pieces of the profiles of a chunk's transition times: (R, T, 2, `MOST_KEPT`, 5).
+    """Return the pieces of the profiles of a chunk's transition times: (R, T, 2, `MOST_PIECES_OF_SIDE`, 5).
 
     Parameters
     ----------

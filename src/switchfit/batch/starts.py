@@ -29,6 +29,7 @@ from switchfit.problem.validation.arrays import as_array, as_count, as_seed
 from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.presentation import Drawn, draw_figure
+from switchfit.strategy.many_starts import SAME_COST
 from switchfit.strategy.random_starts import MOST_DRAWN, draw_starts
 from switchfit.uncertainty.verdict import Verdict
 
@@ -37,9 +38,6 @@ ENDS_TRIED = 10
 
 CLEARLY_LOWER = 1e-4
 """Part of the best cost by which another end is better: on the mesh that all starts share costs are less accurate."""
-
-SAME_COST = 1e-6
-"""Two ends are one minimum if their costs differ by less than this part of them."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

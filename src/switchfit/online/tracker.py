@@ -31,9 +31,6 @@ from switchfit.strategy.sequences import Integers, Rules, Sequences, encode, sel
 KEPT_NODES = 32
 """Nodes whose hypotheses are kept, to go on from them where a sample comes late."""
 
-ALWAYS = 2
-"""Hypotheses that are kept whatever their value: with what was declared, and without its last change."""
-
 MOST_OF_ONE_SEQUENCE = 8
 """Hypotheses with the same sequence that are kept, at most. Of fewer, those that fit the noise of the last second best
 leave no room for a change that begins."""

@@ -2,7 +2,3 @@
 
 `parts` lists them, `runner` runs them. Imports `report` and the rooms before it.
 """
-
-from __future__ import annotations
-
-__all__ = ["PARTS", "run"]

@@ -33,9 +33,6 @@ Equation: TypeAlias = JaxprEqn
 Atom: TypeAlias = Var | Literal
 """An operand or a result of an operation: a variable, or a number that stands in the jaxpr."""
 
-COMPILE_EVENTS = "/jax/core/compile/jaxpr_to_mlir_module_duration", "/jax/core/compile/backend_compile_duration"
-"""JAX's names, for listeners of `jax.monitoring`, of what it does when it compiles."""
-
 
 # Jaxprs
 

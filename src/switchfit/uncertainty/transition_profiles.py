@@ -1,7 +1,7 @@
 """Profiles of the transition times of a fit that samples or kinks are near, where one parabola is no picture.
 
 With samples within a few standard errors of the estimate, J is made of one parabola for each stretch between samples.
-Of many fits the pieces are kept (`switchfit.batch.study`), so that intervals can be had at any level.
+Of many fits the pieces are kept (`switchfit.batch.interval_pieces`), so that intervals can be had at any level.
 """
 
 from __future__ import annotations
