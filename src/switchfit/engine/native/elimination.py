@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from switchfit.arrays import FloatArray
 from switchfit.discretization.rows import couple
 from switchfit.engine.native.llvm.routines import count_doubles
-from switchfit.engine.native.scalars.graph import Graph, Node, Objects, as_objects
+from switchfit.engine.native.scalars.graph import Graph, Node, Objects, Scalar, as_objects
 from switchfit.engine.native.tracing.entries import known_number
 
 MOST_PRODUCTS = 150
@@ -117,7 +117,7 @@ class Elimination:
         return np.split(x[np.argsort(self._order)], len(right))
 
 
-def _subtract(value: Any, factors: Objects, others: Objects) -> Any:
+def _subtract(value: Scalar, factors: Objects, others: Objects) -> Scalar:
     for factor, other in zip(factors, others, strict=True):
         if factor.number != 0.0:
             value = value - factor * other

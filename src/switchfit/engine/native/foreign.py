@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import sequential_vmap
 
+from switchfit.arrays import Traced
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import build_rows
 from switchfit.engine.native.layout import layout_of
@@ -19,6 +20,8 @@ from switchfit.engine.native.llvm.compilation import Program
 from switchfit.engine.native.program import program_of
 from switchfit.engine.native.sizes import Order, Sizes, constants_of
 from switchfit.problem.structure import Structure
+
+Array = jax.Array
 
 _registered: dict[str, Program] = {}
 """Programs whose addresses XLA keeps, by the names of their operations: they must stay alive."""
@@ -45,8 +48,8 @@ def _register(library: Structure, sizes: Sizes) -> str:
 
 
 def foreign_derivatives(
-    structure: Structure, arguments: Arguments, tau: Any, p: Any, side: Any, places: Mapping[str, Any]
-) -> Any:
+    structure: Structure, arguments: Arguments, tau: Array, p: Array, side: Array, places: Mapping[str, Traced]
+) -> tuple[Array, Array, Array]:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a JAX program that runs on a CPU.
 
     The experiment must have machine code, and no late samples. `side` is +1 or -1: the right or left derivative in a

@@ -34,10 +34,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from switchfit.arrays import FloatArray, Traced
 from switchfit.discretization import row_errors, rows, tableaus
 from switchfit.discretization.model import AT_TRANSITIONS
 from switchfit.discretization.rows import Stages, Tangent, combine, times_vector
@@ -46,7 +47,7 @@ from switchfit.discretization.tableaus import EXPLICIT, STIFF
 from switchfit.engine.native.elimination import Elimination, Routine, eliminate
 from switchfit.engine.native.layout import MOST_KEPT_VALUES, has_jumps
 from switchfit.engine.native.llvm.module import Module
-from switchfit.engine.native.scalars.graph import CHECKED, Graph, Namespace, Node, Objects
+from switchfit.engine.native.scalars.graph import CHECKED, Graph, Namespace, Node, Objects, Scalar
 from switchfit.engine.native.scalars.operations import MAY_FAIL
 from switchfit.engine.native.scalars.template import Template
 from switchfit.engine.native.sizes import Order, Sizes
@@ -59,13 +60,16 @@ Places = list[tuple[int, int]]
 Second = dict[tuple[int, int], Node]
 """Entries of a second derivative along (t, x, p), by their places: the lower half, or less."""
 
+TakeInputs: TypeAlias = "Callable[..., tuple[Scalar | Objects, ...]]"
+"""(t, x, w, hb) -> inputs of the template of a stage; w and hb are zero if they are left out."""
+
 Factors = Elimination | Routine | None
 """Those of the coupled equations of an implicit row; None for an explicit one."""
 
-Along = list[tuple[Any, list[Node]]]
+Along = list[tuple[Node | None, list[Node]]]
 """Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
 
-NO_DERIVATIVE: tuple[Any, list[Node]] = (None, [])
+NO_DERIVATIVE: tuple[None, list[Node]] = (None, [])
 """The derivative of a time that does not depend on theta."""
 
 JUMP_WEIGHT = 1e4
@@ -177,7 +181,7 @@ class Kernels:
         wanted, kept = self._find_needs(stage, costs)
         at_stages: list[list[Objects]] = []
 
-        def field(t: Any, X: Any) -> Objects:
+        def field(t: Scalar, X: Objects) -> Objects:
             at_stages.append(stage(graph, *at(t, X), only=wanted, also=kept, checked=checked))
             return at_stages[-1][0]
 
@@ -343,7 +347,7 @@ class Kernels:
         second: list[Second] = [{}] * count
         slopes: list[list[Objects]] = [[]] * count
 
-        def pull(j: int, w: Any, hb: Any) -> tuple[Any, Any, Any]:
+        def pull(j: int, w: Objects, hb: Scalar) -> tuple[Node, Objects, Objects]:
             given = at(times[j], states[j], w, hb)
             g_t, g_x, g_p, S = stage(graph, *given, only=COST_TO_GO, checked=True, known=known[j])
             second[j] = list_entries(S, with_time=moving)
@@ -578,11 +582,11 @@ class Kernels:
         lengths = {"time": 1, "x": self.sizes.n, "origin": 1, "signal": 4 * self.sizes.signals} | lengths
         return [*(p if name == "p" else graph.loads(name, lengths[name]) for name in names), *constants]
 
-    def _row(self, graph: Graph) -> Any:
+    def _row(self, graph: Graph) -> TakeInputs:
         """Return the inputs of a stage of a row as a function, as `take_inputs` does."""
         return self.take_inputs(graph, graph.load("row", 2), "signal")
 
-    def take_inputs(self, graph: Graph, origin: Node, signal_at: str) -> Any:
+    def take_inputs(self, graph: Graph, origin: Node, signal_at: str) -> TakeInputs:
         """Return the inputs of a stage as a function of (t, x, w, hb); w and hb default to zero."""
         (p, constants), zero = self._load_constants(graph), graph.constant(0.0)
         signal = graph.loads(signal_at, 4 * self.sizes.signals)
@@ -596,9 +600,9 @@ class Kernels:
         """Return the derivatives of p along theta."""
         return [graph.unit(self.sizes.T + k) for k in range(self.sizes.M)]
 
-    def _along_p(self, graph: Graph, derivatives: Objects) -> Any:
+    def _along_p(self, graph: Graph, derivatives: Objects) -> Traced:
         """Return ``sum_k derivatives[..., k] p_k'``: of shape (...)."""
-        total: Any = 0.0 if derivatives.ndim == 1 else np.zeros(derivatives.shape[:-1])
+        total: Scalar | Objects | FloatArray = 0.0 if derivatives.ndim == 1 else np.zeros(derivatives.shape[:-1])
         for k, unit in enumerate(self._units(graph)):
             total = total + derivatives[..., k] * unit
         return total
@@ -692,13 +696,13 @@ def _store_changed_rows(H: list[Node], rows: list[Node]) -> list[Store]:
     return [("H", d, row) for d, (old, row) in enumerate(zip(H, rows, strict=True)) if row is not old]
 
 
-def as_vector(graph: Graph, value: Any) -> Node:
+def as_vector(graph: Graph, value: Scalar) -> Node:
     """Return a vector node, also if the value turned out to be a scalar zero."""
     if isinstance(value, Node) and value.vector:
         return value
     return graph.unit(-1)
 
 
-def store_all(pointer: str, offset: int, values: Any) -> list[Store]:
+def store_all(pointer: str, offset: int, values: Iterable[Node]) -> list[Store]:
     """Return stores of values at consecutive places."""
     return [(pointer, offset + k, node) for k, node in enumerate(values)]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.arrays import ArrayModule, BoolArray, FloatArray, IntArray, Traced
 from switchfit.discretization.model import AT_TRANSITIONS
 from switchfit.engine.native.sizes import Sizes
 from switchfit.problem.structure import Structure
@@ -36,7 +37,7 @@ def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
     return {name: np.array([*which, -1], dtype=np.int64) for name, which in found.items()}
 
 
-def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, Any]:
+def find_directions(sizes: Sizes, are_jumps: Traced, xp: ArrayModule) -> tuple[Traced, Traced, Traced]:
     """Return the derivatives of the times in the unknowns of a program, and where an experiment finds its derivatives.
 
     Times of jumps are known: they are no unknowns of the program.
@@ -69,6 +70,6 @@ def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, An
 
 
 @lru_cache(maxsize=64)
-def find_own_directions(sizes: Sizes, N: int, jumps: tuple[int, ...]) -> tuple[Any, Any, Any]:
+def find_own_directions(sizes: Sizes, N: int, jumps: tuple[int, ...]) -> tuple[FloatArray, IntArray, BoolArray]:
     """Return what `find_directions` does for N transitions with these jumps, shared by all meshes."""
     return find_directions(sizes, np.isin(np.arange(N), jumps).astype(np.int64), np)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -304,7 +304,7 @@ class NativeExperiment:
         y += self._check[0]
         return rows[: count[0], 0], rows[: count[0], 1:-1]
 
-    def _find(self, name: str, count: int) -> Any:
+    def _find(self, name: str, count: int) -> Callable[..., None]:
         """Return a function of the driver with a number of arguments: integers and addresses."""
         return self._program.function(f"{self._module.prefix}{name}", count)
 

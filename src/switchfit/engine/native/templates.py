@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
@@ -17,6 +17,8 @@ from switchfit.engine.native.scalars.template import Template
 from switchfit.engine.native.sizes import Order, Shape, Sizes
 from switchfit.engine.native.tracing.trace import trace_scalars
 from switchfit.problem.structure import Structure
+
+Array = jax.Array
 
 F, F_T, F_X, F_P, ELL, _, ELL_X = range(7)
 
@@ -37,7 +39,7 @@ class Templates:
     def __init__(self, library: Structure, sizes: Sizes, order: Order) -> None:
         self.library, self.sizes, self.order = library, sizes, order
 
-    def model(self, constants: tuple[Any, ...]) -> Model:
+    def model(self, constants: tuple[Array, ...]) -> Model:
         """Return the model with traced constants."""
         fixed = sum(not read for _, _, read in self.library.parameters)
         parameters, weights, initial_state = constants[:fixed], constants[fixed:-1], constants[-1]
@@ -57,7 +59,9 @@ class Templates:
         """Trace the only mode of the library, as `stage` does."""
         n, M, mode = self.sizes.n, self.sizes.M, 0
 
-        def stage(model: Model, t: Any, x: Any, p: Any, w: Any, hb: Any, origin: Any, coefficients: Any) -> Any:
+        def stage(
+            model: Model, t: Array, x: Array, p: Array, w: Array, hb: Array, origin: Array, coefficients: Array
+        ) -> Sequence[Array]:
             piece, zero = Piece(origin, coefficients), jnp.zeros(())
             costs, f = running and model.has_running_cost, model.field(mode, piece)
             ell = model.density(mode, piece) if costs else lambda t, x, p: zero
@@ -73,10 +77,10 @@ class Templates:
 
             # With the w_j and h b_j of a row its derivatives are mu_j, and those in t_j and p, of
             # `discretization.rows.adjoint`.
-            def cost_to_go(t: Any, x: Any, p: Any) -> Any:
+            def cost_to_go(t: Array, x: Array, p: Array) -> Array:
                 return w @ f(t, x, p) + hb * ell(t, x, p)
 
-            def gauss_newton() -> Any:
+            def gauss_newton() -> Array:
                 second = self._no_second()
                 residuals = model.reference_residuals(piece) if costs else ()
                 for residual, W in zip(residuals, model.arguments.weights, strict=False):
@@ -87,7 +91,7 @@ class Templates:
 
                 # A running cost is no sum of squares: its own second derivatives stand for it in the Gauss-Newton
                 # matrix.
-                def cost_of_state(_: Any, x: Any, p: Any) -> Any:
+                def cost_of_state(_: Array, x: Array, p: Array) -> Array:
                     return hb * sum(density(t, x, model.parameters(p)) for density in self.library.running)
 
                 return second + _differentiate_twice(cost_of_state, t, x, p)
@@ -102,11 +106,11 @@ class Templates:
         """Trace the cost of a sample and its derivatives."""
         q = self.library.measurements[k].channels
 
-        def sample(model: Model, time: Any, value: Any, weight: Any, x: Any, p: Any) -> Any:
-            def given(t: Any) -> Samples:
+        def sample(model: Model, time: Array, value: Array, weight: Array, x: Array, p: Array) -> Sequence[Array]:
+            def given(t: Array) -> Samples:
                 return Samples(jnp.zeros((), int), t, value, weight)
 
-            def gauss_newton() -> Any:
+            def gauss_newton() -> Array:
                 # rho' / sigma^2 weighs the residuals: the second derivatives of rho are left out with those of h.
                 residual = lambda t, x, p: model.sample_residual(k, given(t), x, p)  # noqa: E731
                 information = model.sample_information(k, given(time), x, p)
@@ -125,7 +129,7 @@ class Templates:
     def late_time(self, k: int) -> Template:
         """Trace the time at which a late sample of the k-th Measurements saw the state, and its derivative in p."""
 
-        def time(model: Model, t: Any, p: Any) -> Any:
+        def time(model: Model, t: Array, p: Array) -> Sequence[Array]:
             sample = Samples(jnp.zeros((), int), t, jnp.zeros(0), jnp.zeros(0))
             return jax.value_and_grad(lambda p: model.correct_delay(k, sample, p).time)(p)
 
@@ -134,7 +138,7 @@ class Templates:
     def end(self) -> Template:
         """Trace the terminal costs."""
 
-        def end(model: Model, x: Any, p: Any) -> Any:
+        def end(model: Model, x: Array, p: Array) -> Sequence[Array]:
             return self._cost(lambda t, x, p: model.terminal(x, p), (jnp.zeros(()), x, p))
 
         return self._trace(end, (self.sizes.n,), (self.sizes.M,), name="a terminal cost")
@@ -149,7 +153,9 @@ class Templates:
     def trace_transition(self, kind: str) -> Template:
         """Trace the only transition of the library, as `transition` does."""
 
-        def at(model: Model, t: Any, x: Any, p: Any, weight: Any, origin: Any, coefficients: Any) -> Any:
+        def at(
+            model: Model, t: Array, x: Array, p: Array, weight: Array, origin: Array, coefficients: Array
+        ) -> Sequence[Array]:
             function = get_transition_function(model, kind, 0, Piece(origin, coefficients))
             if kind == "guards":
                 return self._map(lambda t, x, p: function(t, x, p)[None], (t, x, p), weight)
@@ -161,7 +167,7 @@ class Templates:
     def end_constraint(self) -> Template:
         """Trace all terminal constraints and their first derivatives, then those of the weighted sum."""
 
-        def end(model: Model, x: Any, p: Any, weights: Any) -> Any:
+        def end(model: Model, x: Array, p: Array, weights: Array) -> Sequence[Array]:
             constraints = lambda t, x, p: model.terminal_constraint(x, p)  # noqa: E731
             return self._map(constraints, (jnp.zeros(()), x, p), weights)
 
@@ -176,7 +182,7 @@ class Templates:
         """Trace x(t0), as a reset map that does not depend on t and x."""
         return self._trace_map(lambda model: lambda t, x, p: model.initial_state(p), "initial_state")
 
-    def _trace_map(self, get_map: Callable[[Model], Callable[..., Any]], name: str) -> Template:
+    def _trace_map(self, get_map: Callable[[Model], Callable[..., Array]], name: str) -> Template:
         n = self.sizes.n
         call = lambda model, t, x, p, w: self._map(get_map(model), (t, x, p), w)  # noqa: E731
         return self._trace(call, (), (n,), (self.sizes.M,), (n,), name=name)
@@ -184,8 +190,8 @@ class Templates:
     def outputs(self) -> Template:
         """Trace the outputs, of references, then of Measurements, and their derivatives in x and p."""
 
-        def outputs(model: Model, t: Any, x: Any, p: Any) -> Any:
-            def seen(x: Any, p: Any) -> Any:
+        def outputs(model: Model, t: Array, x: Array, p: Array) -> Sequence[Array]:
+            def seen(x: Array, p: Array) -> Array:
                 each = [model.observe(observe, t, x, p) for observe, _ in self.library.outputs]
                 return jnp.concatenate([jnp.zeros(0), *each])
 
@@ -193,24 +199,26 @@ class Templates:
 
         return self._trace(outputs, (), (self.sizes.n,), (self.sizes.M,), name="observe")
 
-    def _share(self, method: str, setting: Any, **own: Any) -> Template:
+    def _share(self, method: str, setting: object, **own: Any) -> Template:
         """Return what a method traces in a library with nothing but its `own` functions."""
         alone = replace(self.library.functions, measurements=(), terminal=(), **own)
         return _trace_alone(alone, self.sizes._replace(N=0, T=0, m=0), self.order, method, setting)
 
-    def _trace(self, function: Callable[..., Any], *shapes: Shape, name: str) -> Template:
+    def _trace(self, function: Callable[..., Sequence[Array]], *shapes: Shape, name: str) -> Template:
         """Trace a function of the model and of arrays of these shapes; the constants are further inputs."""
 
-        def call(*given: Any) -> Any:
+        def call(*given: Array) -> Sequence[Array]:
             return function(self.model(given[len(shapes) :]), *given[: len(shapes)])
 
         return trace_scalars(call, *shapes, *self.sizes.constants, name=name)
 
-    def _cost(self, value: Callable[..., Any], at: Any, gauss_newton: Callable[[], Any] | None = None) -> list[Any]:
+    def _cost(
+        self, value: Callable[..., Array], at: Sequence[Array], gauss_newton: Callable[[], Array] | None = None
+    ) -> list[Array]:
         """Return a cost with the derivatives of the order at (t, x, p)."""
         return [value(*at), *self._differentiate(value, at, gauss_newton)]
 
-    def _map(self, function: Callable[..., Any], at: Any, weights: Any) -> list[Any]:
+    def _map(self, function: Callable[..., Array], at: Sequence[Array], weights: Array) -> list[Array]:
         """Return values (m,) with Jacobians in t, x and p, then the derivatives of ``weights . values``."""
         if self.order == Order.COST:
             return [function(*at)]
@@ -219,7 +227,9 @@ class Templates:
         weighted = self._differentiate(lambda *at: weights @ function(*at), at, self._no_second)
         return [function(*at), *jacobians, *weighted]
 
-    def _differentiate(self, value: Callable[..., Any], at: Any, gauss_newton: Callable[[], Any] | None) -> list[Any]:
+    def _differentiate(
+        self, value: Callable[..., Array], at: Sequence[Array], gauss_newton: Callable[[], Array] | None
+    ) -> list[Array]:
         """Return the derivatives of the order; at order GAUSS_NEWTON, second ones that are given take their place."""
         if self.order == Order.COST:
             return []
@@ -231,27 +241,27 @@ class Templates:
         second = gauss_newton()
         return [*jax.grad(value, argnums=(0, 1, 2))(*at), second]
 
-    def _no_second(self) -> Any:
+    def _no_second(self) -> Array:
         return jnp.zeros((1 + self.sizes.n + self.sizes.M,) * 2)
 
 
 @lru_cache(maxsize=256)
-def _trace_alone(library: Structure, sizes: Sizes, order: Order, method: str, setting: Any) -> Template:
+def _trace_alone(library: Structure, sizes: Sizes, order: Order, method: str, setting: object) -> Template:
     """Return the template of a library of one function: libraries grow in a search, and derivatives take long."""
     return getattr(Templates(library, sizes, order), method)(setting)
 
 
-def _differentiate_twice(value: Callable[..., Any], t: Any, x: Any, p: Any) -> Any:
+def _differentiate_twice(value: Callable[..., Array], t: Array, x: Array, p: Array) -> Array:
     """Return the matrix of the second derivatives of a scalar along (t, x, p)."""
 
-    def along(z: Any) -> Any:
+    def along(z: Array) -> Array:
         t, *state = jnp.split(z, (1, 1 + x.size))
         return value(t.reshape(()), *state)
 
     return jax.hessian(along)(jnp.concatenate([t.reshape(1), x, p]))
 
 
-def _normal_matrix(residual: Callable[..., Any], weigh: Callable[[Any], Any], *at: Any) -> Any:
+def _normal_matrix(residual: Callable[..., Array], weigh: Callable[[Array], Array], *at: Array) -> Array:
     """Return ``r_d' W r_d`` along (t, x, p); `weigh` multiplies by W."""
     # A time that moves with theta, as of a late sample, is one more direction of the residual.
     t_d, *in_state = jax.jacfwd(residual, argnums=(0, 1, 2))(*at)

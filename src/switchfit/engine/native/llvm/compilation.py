@@ -10,7 +10,7 @@ import ctypes.util
 import hashlib
 import sys
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from importlib import import_module
@@ -45,7 +45,7 @@ class Program:
         Of whose text it is made; that with the highest derivatives is the last.
     """
 
-    def __init__(self, engine: Any, key: str) -> None:
+    def __init__(self, engine: llvm.ExecutionEngine, key: str) -> None:
         self._engine, self.key = engine, key
         self.lock, self.memory = threading.Lock(), np.zeros(0)
         self.modules: dict[Any, Module] = {}
@@ -56,7 +56,7 @@ class Program:
         if len(self.memory) < size:
             self.memory = np.zeros(size)
 
-    def function(self, name: str, count: int) -> Any:
+    def function(self, name: str, count: int) -> Callable[..., None]:
         """Return a Python callable for a void function of so many integers and addresses."""
         if name not in self._functions:
             kind = ctypes.CFUNCTYPE(None, *[ctypes.c_int64] * count)
@@ -97,7 +97,7 @@ def compile_modules(texts: Iterable[str]) -> Program:
     return Program(engine, hashlib.sha256("\n".join(keys).encode()).hexdigest())
 
 
-def _create_machine() -> Any:
+def _create_machine() -> llvm.TargetMachine:
     name, features = _get_processor()
     return llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,10 @@ from numpy.typing import NDArray
 from switchfit.engine.native.scalars.operations import BY_VALUE, COMMUTATIVE, INTEGERS, MAY_FAIL, OPERATIONS
 
 Objects = NDArray[np.object_]
+"""An array of nodes, or of nodes and numbers."""
+
+Scalar: TypeAlias = "Node | float"
+"""A node, or a number or a truth value that is known while a graph is built."""
 
 CHECKED = "check"
 """Name of the pointer to a double that is NaN once a value presumed finite was not."""
@@ -31,7 +35,7 @@ CHECKED = "check"
 def _operator(op: str, swapped: bool = False) -> Callable[[Any, Any], Any]:
     """Return the method of a node that applies an operation to it and another operand, or the other way round."""
 
-    def method(self: Any, other: Any) -> Any:
+    def method(self: Node, other: Scalar | Objects) -> Node:
         if isinstance(other, np.ndarray):
             return NotImplemented  # NumPy then does it entry by entry
         return self.graph.apply(op, other, self) if swapped else self.graph.apply(op, self, other)
@@ -59,8 +63,8 @@ class Node:
         self.truth = _is_truth(op, args)
 
     @property
-    def number(self) -> Any:
-        """Value of a constant; None for every other node."""
+    def number(self) -> float | None:
+        """Value of a constant, a double or a truth value; None for every other node."""
         return self.args[0] if self.op == "const" else None
 
     @property
@@ -110,7 +114,7 @@ class Graph:
         self._finite: set[int] = set()
         self._uncertain: set[int] = set()
 
-    def constant(self, number: Any) -> Node:
+    def constant(self, number: float | np.bool_ | NDArray[Any]) -> Node:
         """Return the node of a number or a truth value."""
         if isinstance(number, np.ndarray):
             number = number.item()
@@ -144,7 +148,7 @@ class Graph:
         """Return the unit vector e_position, the vector of zeros for a position of none of the unknowns."""
         return self._node("unit", (position,), True)
 
-    def apply(self, op: str, *given: Any) -> Node:
+    def apply(self, op: str, *given: Scalar) -> Node:
         """Return the node of an operation, which may be an existing or a simpler one."""
         args = tuple(a if isinstance(a, Node) else self.constant(a) for a in given)
         # Constants are folded as NumPy computes them, also to infinity and NaN.
@@ -159,7 +163,7 @@ class Graph:
             args = args[::-1]
         return self._node(op, args, any(a.vector for a in args))
 
-    def call(self, op: str, *args: Any, vector: bool = False) -> Node:
+    def call(self, op: str, *args: object, vector: bool = False) -> Node:
         """Return the node of a routine's call; its arguments are nodes, floats, and integers that say what it does."""
         return self._node(op, tuple(self.constant(a) if isinstance(a, float) else a for a in args), vector)
 

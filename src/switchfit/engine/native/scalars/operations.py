@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
+
 LIBM_EFFORT = 20
 """Cost of a function of the C library, in additions."""
 
@@ -85,7 +87,7 @@ def _call(name: str, value: Callable[..., Any], function: str = "", operands: in
     return Operation(name, value, code, operands, function=function, **given)
 
 
-def _round_half_away(a: Any) -> Any:
+def _round_half_away(a: FloatArray) -> FloatArray:
     size = np.abs(a)
     return np.copysign(np.floor(size) + (size - np.floor(size) >= 0.5), a)
 

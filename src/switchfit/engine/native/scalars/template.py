@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.native.scalars.graph import Graph, Node, Objects, as_objects, list_needed
+from switchfit.arrays import Traced
+from switchfit.engine.native.scalars.graph import Graph, Node, Objects, Scalar, as_objects, list_needed
 from switchfit.engine.native.scalars.operations import LONG, OPERATIONS
 
 
@@ -31,7 +32,7 @@ class Template:
     def __call__(
         self,
         graph: Graph,
-        *inputs: Any,
+        *inputs: Scalar | NDArray[Any],
         only: Sequence[int] | None = None,
         also: Sequence[Node] = (),
         checked: bool = False,
@@ -72,13 +73,13 @@ class Template:
         """What `evaluate` does, by the indices of nodes: entries of inputs, numbers, operations on them in order."""
         nodes = self._list_needed(tuple(range(len(self._flat))))
         loads = [(node.index, int(node.args[0]), node.args[1]) for node in nodes if node.op == "load"]
-        known = {node.index: node.number for node in nodes if node.op == "const"}
+        known: dict[int, Any] = {node.index: node.number for node in nodes if node.op == "const"}
         known |= {node.index: node.values for node in nodes if node.op == "table"}
         values = {name: operation.value for name, operation in OPERATIONS.items()}
         values["lookup"] = lambda table, index: table[np.asarray(index, int)]
         return loads, known, [(n.index, values[n.op], [a.index for a in n.args]) for n in nodes if n.op in values]
 
-    def evaluate(self, *inputs: Any) -> list[NDArray[np.float64]]:
+    def evaluate(self, *inputs: Traced) -> list[NDArray[np.float64]]:
         """Evaluate the function with NumPy; the entries of its inputs are numbers, or arrays (L,) of equal length.
 
         The outputs have an axis of length L in front if an input has.

@@ -6,14 +6,25 @@ depends on the state, as a double with bounds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.engine.native.scalars.graph import Graph, Node
 from switchfit.engine.native.tracing.unsupported import check_size
+
+Entry: TypeAlias = Any
+"""A known number or truth value; or what depends on the state: an `Integer` in an array of integers, else a node. Which
+of these it is follows from the type of the array, which no checker of types knows."""
+
+TracedArray: TypeAlias = NDArray[Any]
+"""An array of numbers if all of its entries are known, else an array of objects, its entries."""
+
+Parameters: TypeAlias = Mapping[str, Any]
+"""Parameters of an operation of JAX, by their names there."""
 
 MOST_CHOICES = 64
 """Largest number of state-dependent entries from which an index selects: each takes a comparison and a selection."""
@@ -42,7 +53,7 @@ class Integer:
     high: int
 
     @classmethod
-    def of(cls, graph: Graph, value: Any) -> Integer:
+    def of(cls, graph: Graph, value: Entry) -> Integer:
         """Convert a known integer or a truth value to an `Integer`; return an `Integer` as it is."""
         if isinstance(value, Integer):
             return value
@@ -51,11 +62,11 @@ class Integer:
         return cls(graph.constant(float(value)), int(value), int(value))
 
 
-def _is_known_integer(value: Any) -> bool:
+def _is_known_integer(value: object) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
-def choose(graph: Graph, condition: Any, yes: Any, no: Any) -> Any:
+def choose(graph: Graph, condition: Entry, yes: Entry, no: Entry) -> Entry:
     """Select one of two entries of the same type; the condition may be known or traced."""
     known = known_number(condition)
     if known is not None:
@@ -67,7 +78,7 @@ def choose(graph: Graph, condition: Any, yes: Any, no: Any) -> Any:
     return graph.apply("select", condition, yes, no)
 
 
-def less(graph: Graph, a: Any, b: Any) -> Any:
+def less(graph: Graph, a: Entry, b: Entry) -> Entry:
     """Return whether a < b for integers: a bool if their bounds decide it."""
     one, other = Integer.of(graph, a), Integer.of(graph, b)
     if one.high < other.low:
@@ -77,7 +88,7 @@ def less(graph: Graph, a: Any, b: Any) -> Any:
     return graph.apply("lt", one.node, other.node)
 
 
-def equal(graph: Graph, a: Any, b: Any) -> Any:
+def equal(graph: Graph, a: Entry, b: Entry) -> Entry:
     """Return whether a == b for integers: a bool if their bounds decide it."""
     one, other = Integer.of(graph, a), Integer.of(graph, b)
     if one.high < other.low or other.high < one.low:
@@ -87,7 +98,7 @@ def equal(graph: Graph, a: Any, b: Any) -> Any:
     return graph.apply("eq", one.node, other.node)
 
 
-def clamp(graph: Graph, index: Any, low: int, high: int) -> Any:
+def clamp(graph: Graph, index: Entry, low: int, high: int) -> Entry:
     """Clamp an integer to a range; return an int if the result is known."""
     if not isinstance(index, Integer):
         return min(max(int(index), low), high)
@@ -95,7 +106,7 @@ def clamp(graph: Graph, index: Any, low: int, high: int) -> Any:
     return found.low if found.low == found.high else found
 
 
-def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
+def pick(graph: Graph, entries: Sequence[Entry], index: Integer) -> Entry:
     """Select an entry by an index; the first entry belongs to `index.low`, the last one to `index.high`.
 
     Equal neighbors are merged, so that one number in a row of zeros takes two selections. More than a few known numbers
@@ -109,7 +120,7 @@ def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
     count = len(starts)
     check_size(count, MOST_CHOICES, f"takes one of {count} numbers by an index that depends on the state")
 
-    def select_run(runs: list[int]) -> Any:
+    def select_run(runs: list[int]) -> Entry:
         if len(runs) == 1:
             return entries[runs[0]]
         middle = len(runs) // 2
@@ -119,14 +130,14 @@ def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
     return select_run(starts)
 
 
-def known_number(entry: Any) -> Any:
+def known_number(entry: Entry) -> float | None:
     """Return the value of an entry; None if it depends on the state."""
     if isinstance(entry, Node):
         return entry.number
     return None if isinstance(entry, Integer) else entry
 
 
-def _is_same(one: Any, other: Any) -> bool:
+def _is_same(one: Entry, other: Entry) -> bool:
     if isinstance(one, Integer) and isinstance(other, Integer):
         return one.node is other.node
     a, b = known_number(one), known_number(other)
@@ -135,7 +146,7 @@ def _is_same(one: Any, other: Any) -> bool:
     return bool((a == b and np.signbit(a) == np.signbit(b)) or (a != a and b != b))
 
 
-def _look_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
+def _look_up(graph: Graph, entries: Sequence[Entry], index: Integer) -> Entry:
     check_size(len(entries), MOST_ROWS_OF_TABLE, f"looks up numbers in a table of {len(entries)} entries")
     node = graph.lookup(np.array(entries, dtype=float), index.node - float(index.low))
     if all(isinstance(e, bool | np.bool_) for e in entries):
@@ -145,7 +156,7 @@ def _look_up(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:
     return node
 
 
-def choose_extreme(graph: Graph, extreme: Callable[..., int], a: Any, b: Any) -> Integer:
+def choose_extreme(graph: Graph, extreme: Callable[..., int], a: Entry, b: Entry) -> Integer:
     """Return the smaller (larger) of two integers, as Python's `min` (`max`) does for bounds."""
     one, other = Integer.of(graph, a), Integer.of(graph, b)
     is_first = less(graph, one, other) if extreme is min else less(graph, other, one)

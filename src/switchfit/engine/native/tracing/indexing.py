@@ -8,15 +8,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
-from jax.lax import GatherScatterMode
+from jax.lax import GatherDimensionNumbers, GatherScatterMode, ScatterDimensionNumbers
+from numpy.typing import ArrayLike
 
-from switchfit.engine.native.scalars.graph import Graph, Objects
+from switchfit.engine.native.scalars.graph import Graph, Objects, Scalar
 from switchfit.engine.native.tracing.entries import (
     MOST_CHOICES,
+    Entry,
     Integer,
+    TracedArray,
     choose,
     clamp,
     equal,
@@ -26,15 +29,16 @@ from switchfit.engine.native.tracing.entries import (
 )
 from switchfit.engine.native.tracing.integers import OF_INTEGERS
 from switchfit.engine.native.tracing.unsupported import check_size
+from switchfit.runtime.jax_internals import Equation, array_type
 
-# Windows at indices
+Index: TypeAlias = Entry
+"""A place along an axis: an int, or an `Integer`."""
 
-
-Combine = Callable[[Any, Any, Any], Any]
+Combine = Callable[[Entry, Entry, Entry], Entry]
 """(condition, old entry, update) -> new entry."""
 
 
-def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> Any:
+def take(graph: Graph, a: TracedArray, starts: Sequence[Index], sizes: Sequence[int]) -> TracedArray:
     """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
     moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
     # What the window may reach along each axis.
@@ -52,11 +56,13 @@ def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> A
     return a
 
 
-def _from_table(graph: Graph, a: Any, starts: list[Integer], moving: list[int], sizes: Sequence[int]) -> Objects:
+def _from_table(
+    graph: Graph, a: TracedArray, starts: list[Integer], moving: list[int], sizes: Sequence[int]
+) -> Objects:
     """Take a window of a known array that moves along several axes: each entry by one index into a table."""
     multiply, add, subtract = (partial(OF_INTEGERS[op], graph, {}, np.dtype(int)) for op in ("mul", "add", "sub"))
     spans = [start.high - start.low + 1 for start in starts]
-    index: Any = 0
+    index: Entry = 0
     for start, span in zip(starts, spans, strict=True):
         index = add(multiply(index, span), subtract(start, start.low))
     index = Integer(index.node, 0, int(np.prod(spans)) - 1)
@@ -69,7 +75,9 @@ def _from_table(graph: Graph, a: Any, starts: list[Integer], moving: list[int], 
     return window
 
 
-def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: Combine, condition: Any = True) -> None:
+def put(
+    graph: Graph, a: Objects, starts: Sequence[Index], window: TracedArray, combine: Combine, condition: Scalar = True
+) -> None:
     """Change a window of an array of objects in place, at starts that are in range where the condition holds."""
     ranges = [range(s.low, s.high + 1) if isinstance(s, Integer) else (s,) for s in starts]
     count = int(np.prod([len(r) for r in ranges]))
@@ -85,13 +93,15 @@ def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: C
             a[at] = combine(here, a[at], window[place])
 
 
-def dynamic_slice(graph: Graph, equation: Any, a: Any, *starts: Any) -> Any:
+def dynamic_slice(graph: Graph, equation: Equation, a: TracedArray, *starts: TracedArray) -> TracedArray:
     """Trace `jax.lax.dynamic_slice`: a window that is out of range is moved inside."""
     sizes = equation.params["slice_sizes"]
     return take(graph, a, _move_inside(graph, starts, a.shape, sizes), sizes)
 
 
-def dynamic_update_slice(graph: Graph, equation: Any, a: Any, update: Any, *starts: Any) -> Any:
+def dynamic_update_slice(
+    graph: Graph, equation: Equation, a: TracedArray, update: TracedArray, *starts: TracedArray
+) -> Objects:
     """Trace `jax.lax.dynamic_update_slice`."""
     result = a.astype(object)
     inside = _move_inside(graph, starts, a.shape, update.shape)
@@ -99,29 +109,40 @@ def dynamic_update_slice(graph: Graph, equation: Any, a: Any, update: Any, *star
     return result
 
 
-def _move_inside(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequence[int]) -> list[Any]:
+def _move_inside(
+    graph: Graph, starts: Sequence[TracedArray], shape: Sequence[int], sizes: Sequence[int]
+) -> list[Index]:
     return [clamp(graph, s.item(), 0, n - size) for s, n, size in zip(starts, shape, sizes, strict=True)]
 
 
 def _list_windows(
-    graph: Graph, shape: Sequence[int], indices: Any, sizes: Sequence[int], numbers: Any, inside: Any, many: int
-) -> Iterator[tuple[list[Any], Any, tuple[Any, ...]]]:
+    graph: Graph,
+    shape: Sequence[int],
+    indices: TracedArray,
+    sizes: Sequence[int],
+    numbers: GatherDimensionNumbers | ScatterDimensionNumbers,
+    inside: Sequence[int],
+    many: int,
+) -> Iterator[tuple[list[Index], Scalar, tuple[int | slice, ...]]]:
     """Yield the windows that a gather or a scatter moves.
 
     `inside` are the axes inside windows among the `many` axes of the array of all windows. Of each window: the first
     index along each axis of the operand, moved into range; whether the window was in range; its index in the array of
     all windows.
     """
-    gathers = hasattr(numbers, "start_index_map")
-    axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
-    own = numbers.start_indices_batching_dims if gathers else numbers.scatter_indices_batching_dims
+    axes: Sequence[int]
+    own: Sequence[int]
+    if isinstance(numbers, GatherDimensionNumbers):
+        axes, own = numbers.start_index_map, numbers.start_indices_batching_dims
+    else:
+        axes, own = numbers.scatter_dims_to_operand_dims, numbers.scatter_indices_batching_dims
     batched = dict(zip(numbers.operand_batching_dims, own, strict=True))
     outside = [k for k in range(many) if k not in inside]
     for place in np.ndindex(*indices.shape[:-1]):
         starts: list[Any] = [place[batched[axis]] if axis in batched else 0 for axis in range(len(shape))]
         for axis, start in zip(axes, indices[place], strict=True):
             starts[axis] = start
-        fits: Any = True
+        fits: Scalar = True
         for axis, (start, n, size) in enumerate(zip(starts, shape, sizes, strict=True)):
             for outside_range in (less(graph, start, 0), less(graph, n - size, start)):
                 fits = graph.apply("and", fits, graph.apply("not", outside_range))
@@ -132,9 +153,9 @@ def _list_windows(
         yield starts, fits, tuple(among)
 
 
-def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
+def gather(graph: Graph, equation: Equation, a: TracedArray, indices: TracedArray) -> Objects:
     """Trace `jax.lax.gather`."""
-    params, out = equation.params, equation.outvars[0].aval
+    params, out = equation.params, array_type(equation.outvars[0])
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
     result = np.empty(out.shape, dtype=object)
@@ -149,7 +170,7 @@ def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
     return result
 
 
-def _fill_value(given: Any, dtype: np.dtype[Any]) -> Any:
+def _fill_value(given: ArrayLike | None, dtype: np.dtype[Any]) -> float:
     """Return JAX's value for an index out of range: NaN, True, or the largest unsigned or smallest signed integer."""
     if given is not None:
         return np.asarray(given, dtype).item()
@@ -158,7 +179,9 @@ def _fill_value(given: Any, dtype: np.dtype[Any]) -> Any:
     return True if dtype.kind == "b" else float("nan")
 
 
-def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, combine: Combine) -> Any:
+def scatter(
+    graph: Graph, equation: Equation, a: TracedArray, indices: TracedArray, updates: TracedArray, combine: Combine
+) -> Objects:
     """Trace `jax.lax.scatter`, `scatter_add` and their variants."""
     params = equation.params
     numbers = params["dimension_numbers"]

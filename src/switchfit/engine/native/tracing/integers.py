@@ -13,8 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.engine.native.scalars.graph import Graph, Node
-from switchfit.engine.native.tracing.entries import Integer, choose, choose_extreme, clamp, equal, less
+from switchfit.engine.native.scalars.graph import Graph, Node, Scalar
+from switchfit.engine.native.tracing.entries import (
+    Entry,
+    Integer,
+    Parameters,
+    choose,
+    choose_extreme,
+    clamp,
+    equal,
+    less,
+)
 from switchfit.engine.native.tracing.unsupported import Unsupported
 
 Meaning = Callable[..., Any]
@@ -31,7 +40,7 @@ def _bounds(dtype: np.dtype[Any]) -> tuple[int, int]:
     return max(info.min, -LARGEST_EXACT), min(info.max, LARGEST_EXACT)
 
 
-def within(graph: Graph, found: Integer, dtype: np.dtype[Any]) -> Any:
+def within(graph: Graph, found: Integer, dtype: np.dtype[Any]) -> Entry:
     """Return an integer as one of a type, clamped to its range: it may be an index of memory."""
     least, most = _bounds(dtype)
     if found.high < least or found.low > most:
@@ -45,7 +54,7 @@ def within(graph: Graph, found: Integer, dtype: np.dtype[Any]) -> Any:
 def _exactly(op: str, value: Callable[..., int]) -> Meaning:
     """Return an operation on doubles; its result is between the extremes at the bounds of the operands and at zero."""
 
-    def apply(graph: Graph, params: Any, dtype: np.dtype[Any], *given: Any) -> Any:
+    def apply(graph: Graph, params: Parameters, dtype: np.dtype[Any], *given: Entry) -> Entry:
         args = [Integer.of(graph, a) for a in given]
         corners = [value(*c) for c in product(*((a.low, a.high, min(max(0, a.low), a.high)) for a in args))]
         low, high = min(corners), max(corners)
@@ -61,7 +70,7 @@ def _drop_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -
     return graph.apply("select", graph.apply("eq", node, 0.0), 0.0, node)
 
 
-def _divide(graph: Graph, params: Any, dtype: np.dtype[Any], one: Any, other: Any) -> Any:
+def _divide(graph: Graph, params: Parameters, dtype: np.dtype[Any], one: Entry, other: Entry) -> Entry:
     """Divide, rounded towards zero; division by zero yields -1."""
     a, b = Integer.of(graph, one), Integer.of(graph, other)
     largest = max(abs(a.low), abs(a.high), 1)
@@ -70,7 +79,7 @@ def _divide(graph: Graph, params: Any, dtype: np.dtype[Any], one: Any, other: An
     return choose(graph, equal(graph, b, 0), -1, within(graph, Integer(node, low, largest), dtype))
 
 
-def _find_remainder(graph: Graph, params: Any, dtype: np.dtype[Any], one: Any, other: Any) -> Any:
+def _find_remainder(graph: Graph, params: Parameters, dtype: np.dtype[Any], one: Entry, other: Entry) -> Entry:
     """Return the remainder with the sign of the dividend; for a division by zero, it is the dividend itself."""
     a, b = Integer.of(graph, one), Integer.of(graph, other)
     nonzero = Integer.of(graph, choose(graph, equal(graph, b, 0), 1, b))
@@ -80,7 +89,7 @@ def _find_remainder(graph: Graph, params: Any, dtype: np.dtype[Any], one: Any, o
     return choose(graph, equal(graph, b, 0), a, Integer(node, low, high))
 
 
-def from_double(graph: Graph, kind: np.dtype[Any], a: Any) -> Any:
+def from_double(graph: Graph, kind: np.dtype[Any], a: Scalar) -> Entry:
     """Return a double as an integer of a type: rounded towards zero, NaN to 0, clipped to the bounds."""
     (least, most), rounded = _bounds(kind), graph.apply("trunc", a)
     number = graph.apply("select", graph.apply("lt", 0.0, graph.apply("abs", rounded)), rounded, 0.0)

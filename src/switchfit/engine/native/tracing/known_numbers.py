@@ -8,12 +8,16 @@ from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import NDArray
 
+from switchfit.arrays import Traced
 from switchfit.engine.native.scalars.graph import Graph
 from switchfit.engine.native.scalars.operations import OPERATIONS
+from switchfit.engine.native.tracing.entries import TracedArray
 from switchfit.engine.native.tracing.moves import broadcast_in_dim
 from switchfit.engine.native.tracing.rules import INDEXED
 from switchfit.engine.native.tracing.unsupported import Unsupported
+from switchfit.runtime.jax_internals import Equation, array_type
 
 BY_NUMPY: dict[str, Callable[..., Any]] = {
     "iota": lambda params: broadcast_in_dim(
@@ -31,15 +35,15 @@ BY_NUMPY: dict[str, Callable[..., Any]] = {
 """Frequent operations on known numbers, evaluated by NumPy, since calling XLA for each would be slow."""
 
 
-def as_numpy(value: Any) -> Any:
+def as_numpy(value: Traced) -> TracedArray:
     """Return a NumPy array; typed random keys of JAX, for which NumPy has no type, stay as they are."""
     extended = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
     return value if extended or isinstance(value, np.ndarray) else np.asarray(value)
 
 
-def evaluate_known(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+def evaluate_known(graph: Graph, equation: Equation, args: list[NDArray[Any]]) -> list[TracedArray]:
     """Evaluate an operation on known numbers: indexing here, frequent operations by NumPy and all others by XLA."""
-    name, out = equation.primitive.name, [variable.aval for variable in equation.outvars]
+    name, out = equation.primitive.name, [array_type(variable) for variable in equation.outvars]
     if name in INDEXED:  # rows of tangents: XLA would take 60 ms to compile each
         with suppress(Unsupported):
             return [np.asarray(INDEXED[name](graph, equation, *args)).astype(out[0].dtype)]

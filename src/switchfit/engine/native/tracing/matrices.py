@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from switchfit.engine.native.scalars.graph import Graph, Node, Objects, as_objects
-from switchfit.engine.native.tracing.entries import choose, equal, known_number, pick
+from switchfit.engine.native.tracing.entries import TracedArray, choose, equal, known_number, pick
+from switchfit.engine.native.tracing.indexing import Index
 from switchfit.engine.native.tracing.unsupported import check_size
+from switchfit.runtime.jax_internals import Equation
 
 MOST_ROWS_TO_PIVOT = 5
 """Largest number of rows in an LU factorization, whose pivots take selections."""
@@ -25,7 +26,7 @@ MOST_KNOWN_ROWS = 30
 """Largest number of rows in a triangular system whose matrix is known."""
 
 
-def _map_matrices(graph: Graph, function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[Any]:
+def _map_matrices(graph: Graph, function: Callable[..., tuple[Objects, ...]], *arrays: TracedArray) -> list[Objects]:
     """Map a function of matrices of nodes over arrays of matrices."""
     batch, to_node = arrays[0].shape[:-2], lambda value: value if isinstance(value, Node) else graph.constant(value)
     given = [np.asarray(np.frompyfunc(to_node, 1, 1)(a), dtype=object) for a in arrays]
@@ -37,15 +38,15 @@ def _check_rows(rows: int, most: int) -> None:
     check_size(rows, most, f"works with a matrix of {rows} rows")
 
 
-def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:
+def lu(graph: Graph, equation: Equation, a: TracedArray) -> list[Objects]:
     """Trace `jax.lax.linalg.lu`: L and U in one matrix, the pivots, the permutation."""
     _check_rows(max(a.shape[-2:]), MOST_ROWS_TO_PIVOT)
     return _map_matrices(graph, partial(_lu, graph), a)
 
 
-def _lu(graph: Graph, a: Objects) -> tuple[Any, ...]:
-    order: Any = np.array(range(len(a)), dtype=object)
-    pivots: list[Any] = []
+def _lu(graph: Graph, a: Objects) -> tuple[Objects, ...]:
+    order = np.array(range(len(a)), dtype=object)
+    pivots: list[Index] = []
     for k in range(min(a.shape)):
         pivots.append(_find_largest(graph, a[:, k], k))
         a = _exchange_rows(graph, a, k, pivots[k])
@@ -57,7 +58,7 @@ def _lu(graph: Graph, a: Objects) -> tuple[Any, ...]:
     return a, as_objects(pivots), order
 
 
-def _find_largest(graph: Graph, column: Objects, k: int) -> Any:
+def _find_largest(graph: Graph, column: Objects, k: int) -> Index:
     """Return the index of the largest entry from k on, the first of several; entries known to be zero are skipped."""
     size, found = graph.apply("abs", column[k]), k
     for i in range(k + 1, len(column)):
@@ -69,7 +70,7 @@ def _find_largest(graph: Graph, column: Objects, k: int) -> Any:
     return found
 
 
-def _exchange_rows(graph: Graph, a: Any, k: int, other: Any) -> Any:
+def _exchange_rows(graph: Graph, a: Objects, k: int, other: Index) -> Objects:
     """Exchange row k with another one from k on, whose index is known or an `Integer`."""
     result = a.copy()
     if isinstance(other, int):
@@ -81,7 +82,7 @@ def _exchange_rows(graph: Graph, a: Any, k: int, other: Any) -> Any:
     return result
 
 
-def cholesky(graph: Graph, equation: Any, a: Any) -> Any:
+def cholesky(graph: Graph, equation: Equation, a: TracedArray) -> Objects:
     """Trace `jax.lax.linalg.cholesky` for a symmetric matrix; L is NaN if the matrix is not positive definite."""
     _check_rows(a.shape[-1], MOST_ROWS)
     return _map_matrices(graph, lambda matrix: (_cholesky(graph, matrix),), a)[0]
@@ -100,14 +101,14 @@ def _cholesky(graph: Graph, a: Objects) -> Objects:
     return L
 
 
-def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
+def triangular_solve(graph: Graph, equation: Equation, a: TracedArray, b: TracedArray) -> Objects:
     """Trace `jax.lax.linalg.triangular_solve`."""
     _check_rows(a.shape[-1], MOST_ROWS if a.dtype == object else MOST_KNOWN_ROWS)
     params = equation.params
     turned = params["transpose_a"] == params["left_side"]  # x A = b is A' x' = b'
     is_lower, unit = params["lower"] != turned, params["unit_diagonal"]
 
-    def solve(a: Objects, b: Objects) -> tuple[Any, ...]:
+    def solve(a: Objects, b: Objects) -> tuple[Objects, ...]:
         a, b = a.T if turned else a, b if params["left_side"] else b.T
         x = _substitute(a, b, unit) if is_lower else _substitute(a[::-1, ::-1], b[::-1], unit)[::-1]
         return (x if params["left_side"] else x.T,)

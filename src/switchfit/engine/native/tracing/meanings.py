@@ -12,7 +12,7 @@ import numpy as np
 from switchfit.engine.native.scalars.graph import Graph, Node
 from switchfit.engine.native.scalars.operations import OPERATIONS
 from switchfit.engine.native.tracing import integers, sorting
-from switchfit.engine.native.tracing.entries import Integer, choose, less
+from switchfit.engine.native.tracing.entries import Entry, Integer, Parameters, choose, less
 from switchfit.engine.native.tracing.integers import Meaning
 from switchfit.engine.native.tracing.unsupported import Unsupported
 
@@ -20,7 +20,7 @@ OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": 
 """Public names of operations for which it is not `jax.lax.NAME`."""
 
 
-def get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+def get_meaning(graph: Graph, name: str, params: Parameters, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """Return what an operation does to entries, of arrays of which the last has a type."""
     table = OF_ALL | {"f": OF_DOUBLES, "b": OF_TRUTH}.get(dtype.kind, integers.OF_INTEGERS)
     if name in table:
@@ -33,7 +33,7 @@ def get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> C
 # Entries of any type
 
 
-def _convert(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
+def _convert(graph: Graph, params: Parameters, dtype: np.dtype[Any], a: Entry) -> Entry:
     kind = np.dtype(params["new_dtype"])
     if kind.kind not in "biu" and kind != np.float64:
         raise Unsupported(f"converts what depends on the state to {kind}")
@@ -47,7 +47,7 @@ def _convert(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
     return number.node if kind.kind == "f" else graph.apply("ne", number.node, 0.0)
 
 
-def _raise_to_integer(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
+def _raise_to_integer(graph: Graph, params: Parameters, dtype: np.dtype[Any], a: Entry) -> Entry:
     exponent, multiply = int(params["y"]), get_meaning(graph, "mul", {}, dtype)
     # By squares: x^k takes about 2 log2 k products.
     result, square, left = 1, a, abs(exponent)
@@ -59,7 +59,9 @@ def _raise_to_integer(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -
     return graph.apply("div", 1.0, result) if exponent < 0 else result
 
 
-def select_case(graph: Graph, params: Any, dtype: Any, which: Any, *cases: Any) -> Any:
+def select_case(
+    graph: Graph, params: Parameters | None, dtype: np.dtype[Any] | None, which: Entry, *cases: Entry
+) -> Entry:
     """Select one of several cases by a truth value or an integer."""
     if not isinstance(which, Node | Integer):
         return cases[int(which)]
@@ -71,7 +73,7 @@ def select_case(graph: Graph, params: Any, dtype: Any, which: Any, *cases: Any) 
     return result
 
 
-def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any], low: Any, a: Any, high: Any) -> Any:
+def _clamp(graph: Graph, params: Parameters, dtype: np.dtype[Any], low: Entry, a: Entry, high: Entry) -> Entry:
     smaller, larger = (get_meaning(graph, name, {}, dtype) for name in ("min", "max"))
     return smaller(larger(a, low), high)
 
@@ -92,13 +94,13 @@ def _apply_operation(op: str) -> Meaning:
     return lambda graph, params, dtype, *entries: graph.apply(op, *entries)
 
 
-def _round(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
+def _round(graph: Graph, params: Parameters, dtype: np.dtype[Any], a: Entry) -> Entry:
     """Round to the nearest integer; a half to the even one, or away from zero."""
     to_even = params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
     return graph.apply("rint" if to_even else "round", a)
 
 
-def _sign(graph: Graph, params: Any, dtype: np.dtype[Any], a: Any) -> Any:
+def _sign(graph: Graph, params: Parameters, dtype: np.dtype[Any], a: Entry) -> Entry:
     negative = graph.apply("select", graph.apply("lt", a, 0.0), -1.0, a)  # 0 and NaN are unchanged
     return graph.apply("select", graph.apply("lt", 0.0, a), 1.0, negative)
 

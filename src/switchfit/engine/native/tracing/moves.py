@@ -7,18 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from switchfit.engine.native.tracing.entries import Parameters, TracedArray
 from switchfit.problem.jaxprs import SELECTIONS as SELECTIONS
 
-# Operations that move entries
 
-
-def broadcast_in_dim(params: Any, a: Any, *_: Any) -> Any:
+def broadcast_in_dim(params: Parameters, a: TracedArray, *_: TracedArray) -> TracedArray:
     """Return an array in a larger shape, repeated along the new axes."""
     others = [k for k in range(len(params["shape"])) if k not in params["broadcast_dimensions"]]
     return np.broadcast_to(np.expand_dims(a, others), params["shape"])
 
 
-def _pad(params: Any, a: Any, value: Any) -> Any:
+def _pad(params: Parameters, a: TracedArray, value: TracedArray) -> TracedArray:
     """Insert entries between and around those of an array; a negative count at an end removes entries."""
     shape, inside, places = [], [], []
     for n, (low, high, between) in zip(a.shape, params["padding_config"], strict=True):

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.engine.native.scalars.graph import Graph, Node, as_objects
+from switchfit.engine.native.scalars.graph import Graph, Node, Objects, as_objects
 from switchfit.engine.native.scalars.operations import OPERATIONS
 from switchfit.engine.native.tracing import indexing, matrices, sorting
-from switchfit.engine.native.tracing.entries import Integer, choose, known_number
+from switchfit.engine.native.tracing.entries import Entry, Integer, TracedArray, choose, known_number
 from switchfit.engine.native.tracing.meanings import get_meaning
 from switchfit.engine.native.tracing.unsupported import Unsupported
+from switchfit.runtime.jax_internals import Equation, array_type
 
 SUMS = {"sum": "add", "prod": "mul", "max": "max", "min": "min"}
 
@@ -20,8 +21,8 @@ SUMS = {"sum": "add", "prod": "mul", "max": "max", "min": "min"}
 # Whole arrays
 
 
-def _dot(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
-    if any(variable.aval.dtype != np.float64 for variable in equation.invars):
+def _dot(graph: Graph, equation: Equation, a: TracedArray, b: TracedArray) -> Objects:
+    if any(array_type(variable).dtype != np.float64 for variable in equation.invars):
         raise Unsupported("multiplies matrices of truth values or integers that depend on the state")
     (sum_a, sum_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     of_a, of_b = list(range(a.ndim)), list(range(a.ndim, a.ndim + b.ndim))
@@ -36,8 +37,8 @@ def _dot(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
 def _reduce(name: str) -> Callable[..., Any]:
     """Reduce over axes by an operation."""
 
-    def over(graph: Graph, equation: Any, a: Any) -> Any:
-        combine = np.frompyfunc(get_meaning(graph, name, {}, equation.invars[0].aval.dtype), 2, 1)
+    def over(graph: Graph, equation: Equation, a: TracedArray) -> TracedArray:
+        combine = np.frompyfunc(get_meaning(graph, name, {}, array_type(equation.invars[0]).dtype), 2, 1)
         for axis in sorted(equation.params["axes"], reverse=True):
             a = combine.reduce(a, axis=axis, dtype=object)
         return a
@@ -48,9 +49,9 @@ def _reduce(name: str) -> Callable[..., Any]:
 def _accumulate(name: str) -> Callable[..., Any]:
     """Accumulate along an axis by an operation."""
 
-    def along(graph: Graph, equation: Any, a: Any) -> Any:
+    def along(graph: Graph, equation: Equation, a: TracedArray) -> TracedArray:
         axis, turned = equation.params["axis"], equation.params["reverse"]
-        combine = np.frompyfunc(get_meaning(graph, name, {}, equation.invars[0].aval.dtype), 2, 1)
+        combine = np.frompyfunc(get_meaning(graph, name, {}, array_type(equation.invars[0]).dtype), 2, 1)
         ordered = np.flip(a, axis) if turned else a
         result = combine.accumulate(ordered, axis=axis, dtype=object)
         return np.flip(result, axis) if turned else result
@@ -61,11 +62,11 @@ def _accumulate(name: str) -> Callable[..., Any]:
 def _find_first(name: str) -> Callable[..., Any]:
     """Find the index of the largest (smallest) entry along an axis, the first of several; NaN counts as extreme."""
 
-    def along(graph: Graph, equation: Any, a: Any) -> Any:
-        (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
+    def along(graph: Graph, equation: Equation, a: TracedArray) -> TracedArray:
+        (axis,), dtype = equation.params["axes"], array_type(equation.invars[0]).dtype
         reaches = get_meaning(graph, name, {}, dtype)  # false for NaN, which is beyond any number
 
-        def first(row: Any) -> Any:
+        def first(row: TracedArray) -> Entry:
             best, found = row[0], 0
             for k, value in enumerate(row[1:], start=1):
                 better = graph.apply("not", reaches(best, value))
@@ -83,10 +84,12 @@ def _find_first(name: str) -> Callable[..., Any]:
 def _scatter(name: str | None) -> Callable[..., Any]:
     """Return a scatter that combines old entries with updates by an operation, or replaces them."""
 
-    def scatter_entries(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any) -> Any:
-        dtype = equation.outvars[0].aval.dtype
+    def scatter_entries(
+        graph: Graph, equation: Equation, a: TracedArray, indices: TracedArray, updates: TracedArray
+    ) -> Objects:
+        dtype = array_type(equation.outvars[0]).dtype
 
-        def combine(here: Any, old: Any, update: Any) -> Any:
+        def combine(here: Entry, old: Entry, update: Entry) -> Entry:
             if name is None:
                 return choose(graph, here, update, old)
             # Known place, known numbers: no node at all.

@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from switchfit.engine.native.scalars.graph import Graph, as_objects
-from switchfit.engine.native.tracing.entries import MOST_ROWS_OF_TABLE, Integer, choose, clamp, known_number, less
+from switchfit.engine.native.scalars.graph import Graph, Node, Objects, Scalar, as_objects
+from switchfit.engine.native.tracing.entries import (
+    MOST_ROWS_OF_TABLE,
+    Entry,
+    Integer,
+    TracedArray,
+    choose,
+    clamp,
+    known_number,
+    less,
+)
 from switchfit.engine.native.tracing.unsupported import Unsupported, check_size
+from switchfit.runtime.jax_internals import Equation, array_type
 
 MOST_SORTED = 16
 """Largest number of entries to sort. n entries take n (n - 1) / 2 comparisons, each followed by selections."""
 
-Entries = tuple[Any, ...]
+Row = tuple[Entry, ...]
 """Entries that move together: one of each array that is sorted."""
 
 
-def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
+def sort(graph: Graph, equation: Equation, *arrays: TracedArray) -> list[TracedArray]:
     """Trace `jax.lax.sort`: stable, NaN last, by the first array."""
     axis, shape = equation.params["dimension"], arrays[0].shape
     if equation.params["num_keys"] > 1:
         raise Unsupported("sorts by several keys what depends on the state")
-    is_double = equation.invars[0].aval.dtype.kind == "f"
+    is_double = array_type(equation.invars[0]).dtype.kind == "f"
     rows = [np.moveaxis(a, axis, -1).reshape(-1, shape[axis]) for a in arrays]
     found = [np.empty(row.shape, dtype=object) for row in rows]
     for k in range(len(rows[0])):
@@ -33,7 +41,7 @@ def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
     return [np.moveaxis(each.reshape(*moved, shape[axis]), -1, axis) for each in found]
 
 
-def _sort_entries(graph: Graph, entries: list[Entries], is_double: bool) -> list[Entries]:
+def _sort_entries(graph: Graph, entries: list[Row], is_double: bool) -> list[Row]:
     """Sort entries by exchanging neighbors."""
     n = len(entries)
     check_size(n, MOST_SORTED, f"sorts {n} numbers that depend on the state")
@@ -55,7 +63,7 @@ def _sort_entries(graph: Graph, entries: list[Entries], is_double: bool) -> list
 # Searching sorted arrays
 
 
-def compare_in_order(graph: Graph, op: str, a: Any, b: Any) -> Any:
+def compare_in_order(graph: Graph, op: str, a: Entry, b: Entry) -> Node:
     """Return whether a < b ("lt") or a <= b ("le") in the order in which NaN comes after all numbers."""
     undefined = graph.apply("ne", b, b)
     if op == "lt":
@@ -63,7 +71,7 @@ def compare_in_order(graph: Graph, op: str, a: Any, b: Any) -> Any:
     return graph.apply("or", graph.apply(op, a, b), undefined)
 
 
-def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
+def search(graph: Graph, table: TracedArray, query: TracedArray, right: bool) -> Objects | None:
     """Trace `jnp.searchsorted`: the insertion index of each number in a sorted table of known ones, (K,).
 
     It is a bisection in memory, in a fixed number of log2 K steps. None for any other table.
@@ -76,8 +84,8 @@ def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
     turns = K.bit_length()
     padded = np.concatenate([numbers, np.full(2**turns - 1 - K, np.inf)])
 
-    def place(x: Any) -> Any:
-        found: Any = graph.constant(0.0)
+    def place(x: Scalar) -> Entry:
+        found = graph.constant(0.0)
         for step in (2**k for k in reversed(range(turns))):
             entry = graph.lookup(padded, found + float(step - 1))
             beyond = graph.apply("not", graph.apply("lt" if right else "le", x, entry))  # NaN comes after all numbers

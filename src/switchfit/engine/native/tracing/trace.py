@@ -10,22 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import jax
 import numpy as np
 
+from switchfit.arrays import Traced
 from switchfit.engine.native.scalars.graph import Graph
 from switchfit.engine.native.scalars.template import Template
 from switchfit.engine.native.tracing import sorting
-from switchfit.engine.native.tracing.entries import known_number
+from switchfit.engine.native.tracing.entries import TracedArray, known_number
 from switchfit.engine.native.tracing.known_numbers import as_numpy, evaluate_known
 from switchfit.engine.native.tracing.meanings import get_meaning, select_case
 from switchfit.engine.native.tracing.moves import MOVING_OPERATIONS
 from switchfit.engine.native.tracing.rules import ARRAY_RULES
 from switchfit.engine.native.tracing.unsupported import Unsupported
 from switchfit.problem.jaxprs import Walk, find_line, find_public_name, list_jaxprs
-from switchfit.runtime.jax_internals import drop_unused
+from switchfit.runtime.jax_internals import ClosedJaxpr, Equation, Jaxpr, array_type, drop_unused
 
 __all__ = ["Unsupported", "trace_scalars"]
 
@@ -37,7 +37,7 @@ CALLS = "jit", "closed_call", "remat2", "checkpoint", "custom_jvp_call", "custom
 
 
 def trace_scalars(
-    function: Callable[..., Sequence[Any]], *shapes: tuple[int, ...], name: str = "the function"
+    function: Callable[..., Sequence[Traced]], *shapes: tuple[int, ...], name: str = "the function"
 ) -> Template:
     """Trace a function of float64 arrays of the given shapes, which returns a flat list of arrays.
 
@@ -55,14 +55,14 @@ def trace_scalars(
         jaxpr, _ = drop_unused(closed.jaxpr, True)
         with np.errstate(all="ignore"):
             outputs = _Tracing(graph).run(jaxpr, closed.consts, inputs)
-        if any(variable.aval.dtype != np.float64 for variable in closed.jaxpr.outvars):
+        if any(array_type(variable).dtype != np.float64 for variable in closed.jaxpr.outvars):
             raise Unsupported("returns something else than float64")
     except Unsupported as error:
         raise Unsupported(f"{name} {error.what}", error.where) from error
     return Template(outputs, list(graph.presumed.values()))
 
 
-def _make_jaxpr(function: Callable[..., Sequence[Any]], structs: Sequence[Any]) -> Any:
+def _make_jaxpr(function: Callable[..., Sequence[Traced]], structs: Sequence[jax.ShapeDtypeStruct]) -> ClosedJaxpr:
     try:
         return jax.make_jaxpr(function)(*structs)
     except Exception as error:  # raised by the function, or by JAX: for example, an operation without derivative
@@ -76,10 +76,10 @@ class _Tracing(Walk):
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
 
-    def constant(self, value: Any) -> Any:
+    def constant(self, value: Traced) -> TracedArray:
         return as_numpy(value)
 
-    def apply(self, equation: Any, given: list[Any], origin: Any) -> Sequence[Any]:
+    def apply(self, equation: Equation, given: list[TracedArray], origin: Equation) -> Sequence[TracedArray]:
         try:
             if len(self._graph.nodes) > MOST_NODES:
                 raise Unsupported(f"takes more than {MOST_NODES} operations")
@@ -88,13 +88,13 @@ class _Tracing(Walk):
             raise _add_location(error, equation) from None
 
 
-def _run(graph: Graph, inner: Any, inputs: Sequence[Any]) -> list[Any]:
+def _run(graph: Graph, inner: Jaxpr | ClosedJaxpr, inputs: Sequence[TracedArray]) -> list[TracedArray]:
     """Return the results of a jaxpr that an operation calls, with its constants or without."""
     jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
     return _Tracing(graph).run(jaxpr, consts, [as_numpy(value) for value in inputs])
 
 
-def _add_location(error: Unsupported, equation: Any) -> Unsupported:
+def _add_location(error: Unsupported, equation: Equation) -> Unsupported:
     """Add the line of the user's code, and the name of the JAX function that it calls.
 
     JAX traces functions such as `jnp.sort` once for all callers: the source location of their inner operations may be
@@ -110,13 +110,13 @@ def _add_location(error: Unsupported, equation: Any) -> Unsupported:
     return Unsupported(error.what, error.where or find_line(equation) or None)
 
 
-def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
+def _apply(graph: Graph, equation: Equation, args: list[TracedArray]) -> Sequence[TracedArray]:
     name, params = equation.primitive.name, equation.params
-    shapes = [variable.aval.shape for variable in equation.outvars]
+    shapes = [array_type(variable).shape for variable in equation.outvars]
     if shapes and all(0 in shape for shape in shapes):
         return [np.empty(shape) for shape in shapes]
     # An empty array counts as known, so that JAX evaluates reductions over it.
-    args = [a if a.size else np.empty(a.shape, v.aval.dtype) for a, v in zip(args, equation.invars, strict=True)]
+    args = [a if a.size else np.empty(a.shape, array_type(v).dtype) for a, v in zip(args, equation.invars, strict=True)]
     known = all(a.dtype != object for a in args)
     # The order matters: calls are inlined; what is known is computed at once; only what is left becomes nodes.
     if name in CALLS:
@@ -135,48 +135,48 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     # What depends on the state: loops are unrolled, rules take whole arrays, and meanings one entry at a time.
     if name in LOOPS:
         return LOOPS[name](graph, equation, *args)
-    for dtype in (variable.aval.dtype for variable in equation.invars):
+    for dtype in (array_type(variable).dtype for variable in equation.invars):
         if dtype.kind not in "fbiu" or (dtype.kind == "f" and dtype != np.float64):
             raise Unsupported(f"has numbers of type {dtype} that depend on the state")
     if name in ARRAY_RULES:
         results = ARRAY_RULES[name](graph, equation, *args)
         return results if equation.primitive.multiple_results else [np.asarray(results, dtype=object)]
-    meaning = get_meaning(graph, name, params, equation.invars[-1].aval.dtype)
+    meaning = get_meaning(graph, name, params, array_type(equation.invars[-1]).dtype)
     return [np.asarray(np.frompyfunc(meaning, len(args), 1)(*args), dtype=object)]
 
 
-def _is_search(equation: Any) -> bool:
+def _is_search(equation: Equation) -> bool:
     """Return whether an operation is JAX's search in one sorted array, which `jnp.interp` calls too.
 
     Operands after the array and the numbers are tangents, on which an index does not depend.
     """
     if equation.params.get("name") != "_searchsorted_scan_impl":
         return False
-    table, query = (variable.aval for variable in equation.invars[:2])
-    found = [(variable.aval.shape, query.dtype) for variable in equation.outvars]
+    table, query = (array_type(variable) for variable in equation.invars[:2])
+    found = [(array_type(variable).shape, query.dtype) for variable in equation.outvars]
     return table.ndim == 1 and table.dtype == np.float64 and found == [(query.shape, table.dtype)]
 
 
 # Loops and branches
 
 
-def _scan(graph: Graph, equation: Any, *args: Any) -> list[Any]:
+def _scan(graph: Graph, equation: Equation, *args: TracedArray) -> list[TracedArray]:
     """Unroll a loop of known length."""
     params = equation.params
     fixed, carried, length = params["num_consts"], params["num_carry"], params["length"]
     consts, carry, columns = args[:fixed], list(args[fixed : fixed + carried]), args[fixed + carried :]
-    made: list[list[Any]] = []
+    made: list[list[TracedArray]] = []
     for k in reversed(range(length)) if params["reverse"] else range(length):
         results = _run(graph, params["jaxpr"], [*consts, *carry, *(c[k] for c in columns)])
         carry = results[:carried]
         made.append(results[carried:])
     if not made:
-        return [*carry, *(np.empty(variable.aval.shape) for variable in equation.outvars[carried:])]
+        return [*carry, *(np.empty(array_type(variable).shape) for variable in equation.outvars[carried:])]
     rows = made[::-1] if params["reverse"] else made
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
 
 
-def _cond(graph: Graph, equation: Any, *args: Any) -> list[Any]:
+def _cond(graph: Graph, equation: Equation, *args: TracedArray) -> list[TracedArray]:
     """Trace all branches, and select among their results."""
     which, *operands = args
     choice, branches = which.item(), equation.params["branches"]
@@ -188,7 +188,7 @@ def _cond(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     return [np.asarray(select(*cases), dtype=object) for cases in zip(*results, strict=True)]
 
 
-def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
+def _linear_solve(graph: Graph, equation: Equation, *args: TracedArray) -> list[TracedArray]:
     """Trace the solver of a linear system; JAX has differentiated it before."""
     lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
     # Operands: constants of matvec, vecmat, solve and transpose_solve, in this order, then the right-hand side.
@@ -197,4 +197,8 @@ def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     return _run(graph, jaxprs.solve, [*args[before : before + lengths.solve], *args[right:]])
 
 
-LOOPS: dict[str, Callable[..., list[Any]]] = {"scan": _scan, "cond": _cond, "custom_linear_solve": _linear_solve}
+LOOPS: dict[str, Callable[..., list[TracedArray]]] = {
+    "scan": _scan,
+    "cond": _cond,
+    "custom_linear_solve": _linear_solve,
+}
