@@ -20,7 +20,7 @@ import scipy.optimize
 import switchfit as sf
 from benchmarks.starts.case import Case, Sampled
 from benchmarks.starts.end import End
-from switchfit.estimation.local_fit import REFINEMENTS
+from switchfit.fit.local_fit import REFINEMENTS
 from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.halving import refine_meshes
 from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, judge_meshes

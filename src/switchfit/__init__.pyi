@@ -10,7 +10,10 @@ from switchfit.batch.starts import Multistart as Multistart
 from switchfit.batch.starts import multistart as multistart
 from switchfit.discretization.stiffness import Stiffness as Stiffness
 from switchfit.engine.evaluation import Evaluation as Evaluation
+from switchfit.estimation.comparison import ModelComparison as ModelComparison
+from switchfit.estimation.comparison import compare as compare
 from switchfit.estimation.estimates import Estimate as Estimate
+from switchfit.estimation.estimating import estimate as estimate
 from switchfit.experiment_design.result import Design as Design
 from switchfit.experiment_design.search import design as design
 from switchfit.fit.comparison import Comparison as Comparison
@@ -59,9 +62,6 @@ from switchfit.problem.problem import Problem as Problem
 from switchfit.problem.reference_signals import ReferenceSignal as ReferenceSignal
 from switchfit.problem.system import HybridSystem as HybridSystem
 from switchfit.runtime.issue import Issue as Issue
-from switchfit.strategy.choice import estimate as estimate
-from switchfit.strategy.comparison import ModelComparison as ModelComparison
-from switchfit.strategy.comparison import compare as compare
 from switchfit.strategy.input_correlation import InputCorrelation as InputCorrelation
 from switchfit.strategy.validation import Validation as Validation
 from switchfit.uncertainty.certificate import Certificate as Certificate

@@ -25,7 +25,7 @@ from switchfit.batch.batch import Batch
 from switchfit.batch.chunks import run_chunks
 from switchfit.batch.layout import CHUNK
 from switchfit.batch.programs import Limits, minimize_fits
-from switchfit.estimation.local_fit import fit_locally
+from switchfit.fit.local_fit import fit_locally
 from switchfit.fit.minimization import minimize_cost
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.models import heater_problem

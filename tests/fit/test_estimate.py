@@ -14,8 +14,8 @@ import scipy.stats
 import switchfit as sf
 from support import models
 from support.models import fit_problem
-from switchfit.estimation import estimates
-from switchfit.estimation.insignificance import drop_noise_of_times
+from switchfit.fit import solved_fit
+from switchfit.fit.insignificance import drop_noise_of_times
 from switchfit.fit.minimization import minimize_cost
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.meshes.follower import Follower
@@ -161,8 +161,8 @@ def test_badly_scaled_unknowns_take_the_same_iterates():
 
 
 def test_trajectories_are_simulated_when_they_are_asked_for(monkeypatch):
-    simulate = Mock(side_effect=estimates.compare)
-    monkeypatch.setattr(estimates, "compare", simulate)
+    simulate = Mock(side_effect=solved_fit.compare)
+    monkeypatch.setattr(solved_fit, "compare", simulate)
     fit = sf.estimate(capacitor(voltage(TIMES)))
     simulate.assert_not_called()
     assert fit.trajectories is fit.trajectories

@@ -131,6 +131,6 @@ def test_the_first_use_of_a_result_imports_what_it_needs(quick_processes):
         "print(type(fit.to_pandas()).__name__)": "DataFrame",
         "print(fit.validate(fit.problem).verdict.level)": "good",
     }
-    begin = "from switchfit.models import heater_problem; from switchfit.strategy.choice import estimate"
+    begin = "from switchfit.models import heater_problem; from switchfit.estimation.estimating import estimate"
     for use, expected in uses.items():
         assert run_python(f"{begin}\nfit = estimate(heater_problem())\n{use}").strip() == expected

@@ -26,9 +26,9 @@ from switchfit.batch.program_inputs import ProgramInputs, replace_leaves
 from switchfit.batch.programs import GPU_LOCK, Limits, compile_once, evaluate_fits, minimize_fits
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.corners.branches import has_corners
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.minimization import minimize_cost
 from switchfit.fit.result import list_kinks
+from switchfit.fit.solved_fit import SolvedFit
 from switchfit.fit.termination import Kink, Termination, termination_of
 from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.follower import Follower
@@ -120,7 +120,7 @@ class Batch:
             outcome = self._run_program(starts)
         return self._finish_rest(outcome, starts)
 
-    def replace_fit(self, chunk: Chunk, k: int, again: Estimate) -> None:
+    def replace_fit(self, chunk: Chunk, k: int, again: SolvedFit) -> None:
         """Replace the k-th fit by an estimate, on meshes of its own."""
         ordinary = again.status is Status.CONVERGED and not again.active
         chunk.replace_fit(k, again, list_kinks(again), "" if ordinary else again.message)

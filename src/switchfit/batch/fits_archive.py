@@ -6,7 +6,7 @@ bytes), and the digest of `switchfit.batch.archives`.
 
 from __future__ import annotations
 
-from dataclasses import make_dataclass
+from dataclasses import make_dataclass, replace
 from typing import Any, get_type_hints
 
 from switchfit.estimation.estimates import Estimate
@@ -46,4 +46,4 @@ def load_best(content: Any) -> Estimate | None:
     if content is None:
         return None
     fit, certificate = parse_fit(content)
-    return Estimate(**vars(fit), saved_certificate=certificate)
+    return replace(Estimate.take_over(fit), saved_certificate=certificate)

@@ -12,8 +12,8 @@ import numpy as np
 from switchfit.batch.chunks import run_chunks
 from switchfit.batch.interval_pieces import list_places
 from switchfit.batch.programs import Limits
-from switchfit.estimation.local_fit import check_settings
 from switchfit.fit.hidden_switches import refuse_hidden_switches
+from switchfit.fit.local_fit import check_settings
 from switchfit.fit.statistics import count_priors, measure_variance
 from switchfit.meshes.evaluator import evaluator_of
 from switchfit.problem.origin import Origin

@@ -17,8 +17,8 @@ from switchfit.batch.fits import Fits
 from switchfit.batch.long_run import LongRun, repeat
 from switchfit.batch.simulated_study import Noise, build_study
 from switchfit.batch.study_verdict import judge_study
-from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.guards import place_on_guards
+from switchfit.fit.local_fit import fit_locally
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import objects
 from switchfit.problem.validation.arrays import as_array, as_count, as_seed

@@ -17,8 +17,8 @@ from switchfit.batch.layout import Varying
 from switchfit.batch.programs import Limits
 from switchfit.batch.study import Study
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.local_fit import REFINEMENTS
 from switchfit.fit.comparison import compare
+from switchfit.fit.local_fit import REFINEMENTS
 from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.halving import ORDER_OF_METHODS, halve_rows
 from switchfit.meshes.integration_error import LARGEST_INTEGRATION_ERROR, cost_error

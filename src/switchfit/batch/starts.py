@@ -21,7 +21,7 @@ from switchfit.batch.study import Study
 from switchfit.batch.study_verdict import judge_starts
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimates import Estimate
-from switchfit.estimation.local_fit import fit_locally
+from switchfit.fit.local_fit import fit_locally
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.optimize import Status
 from switchfit.problem.problem import Problem, require_estimable
@@ -190,7 +190,7 @@ def _find_best(problem: Problem, fits: Fits, limits: Limits) -> tuple[Fits, Esti
     for k in np.lexsort((np.nan_to_num(fits.cost, nan=np.inf), ~fits.success))[:ENDS_TRIED].tolist():
         start = fits.theta[k] if np.isfinite(fits.theta[k]).all() else fits.start[k]
         try:
-            best = fit_locally(problem, start=start, **limits._asdict())
+            best = Estimate.take_over(fit_locally(problem, start=start, **limits._asdict()))
             break
         except Exception as error:  # of this end alone: listed
             status[k], message[k] = Status.ERROR.name, describe_failure(error)

@@ -30,8 +30,8 @@ from switchfit.batch.layout import Varying, choose_chunk_size
 from switchfit.batch.programs import Limits
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.data_variation import measure_variation
+from switchfit.fit.local_fit import fit_locally
 from switchfit.fit.statistics import count_priors, measure_variance
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.meshes.halving import halve_rows

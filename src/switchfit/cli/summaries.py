@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.cli.tables import list_unknowns, zip_rows
+from switchfit.estimation.comparison import ModelComparison
 from switchfit.estimation.estimates import Estimate
 from switchfit.experiment_design.result import Design, DesignRecord
 from switchfit.fit.trajectory import Trajectory
@@ -15,7 +16,6 @@ from switchfit.meshes.evaluator import Evaluator
 from switchfit.modes.result import ModeSearch
 from switchfit.report import times
 from switchfit.report.verdict import write_reason, write_step
-from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.derivative_check import DerivativeCheck
 from switchfit.uncertainty.identification import Identifiability

@@ -1,4 +1,4 @@
-"""`Estimate`, the facade of a fit with its methods, and the single fit from one start that returns it.
+"""`Estimate`, the facade of a fit with its methods, which `estimate` returns, and the comparison of several.
 
-Imports `uncertainty` and the rooms before it.
+Imports `strategy` and the rooms before it; no room below imports it.
 """

@@ -39,6 +39,9 @@ LARGEST_INTEGRATION_ERROR = 1e-8
 """Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.fit.accuracy`) above
 which the mesh is refined again, unless rtol allows more."""
 
+LARGE_INTEGRATION_ERROR = 1e-6
+"""Relative change of J or of a constraint by halving the steps, above which it counts as inaccurate."""
+
 PERFECT_FIT = 1e-3
 """If J has fallen below this part of its first value, the integration error is relative to that part, since a cost that
 vanishes has no relative error."""

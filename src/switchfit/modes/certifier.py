@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from switchfit.estimation.estimates import Estimate
-from switchfit.estimation.local_fit import fit_locally
+from switchfit.fit.local_fit import fit_locally
 from switchfit.modes.fitted import Fitted
 from switchfit.modes.schedule import keep_off, spread
 from switchfit.problem.problem import Problem
@@ -68,7 +68,7 @@ class Certifier:
             known = dict(zip(names, fitted.parameters, strict=True))
             rest = [known[name] for name in problem.theta_names[fitted.switches :]]
             start = np.concatenate([*(run.initial_times for run in problem.experiments), rest])
-            self._estimates[fitted.sequences] = fit_locally(problem, start=start)
+            self._estimates[fitted.sequences] = Estimate.take_over(fit_locally(problem, start=start))
         return self._estimates[fitted.sequences]
 
     def find(self, sequences: tuple[tuple[str, ...], ...]) -> Estimate | None:

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.arrays import FloatArray
 from switchfit.engine.hypotheses import Hypotheses
 from switchfit.estimation.estimates import Estimate
+from switchfit.estimation.estimating import estimate
 from switchfit.online.calibration import calibrate
 from switchfit.online.feed import Feed, shift_cubic
 from switchfit.online.files import append_update, read_journal, read_state
@@ -47,7 +48,6 @@ from switchfit.problem.validation.objects import as_instance, as_path
 from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import Beam
-from switchfit.strategy.choice import estimate
 from switchfit.strategy.library import build_library
 from switchfit.strategy.sequences import Rules
 

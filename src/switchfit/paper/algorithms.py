@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.estimation.local_fit import fit_locally
+from switchfit.fit.local_fit import fit_locally
 from switchfit.optimize.minimization_problem import HessianKind
 from switchfit.paper import figure_style, fit_summary
 from switchfit.paper.figure_style import BLUE, DARK, LIGHT, RED

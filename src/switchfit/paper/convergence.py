@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluation import evaluate
+from switchfit.fit.local_fit import fit_locally
 from switchfit.optimize.minimization_problem import HessianKind
 from switchfit.paper import fit_summary, table_rows, vehicle
 from switchfit.paper.algorithms import draw_gradient_norms, fit_kinds

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
-from switchfit.estimation.local_fit import fit_locally
+from switchfit.fit.local_fit import fit_locally
+from switchfit.fit.result import Fit
 from switchfit.fit.simulation import simulate
 from switchfit.optimize import Status
 from switchfit.paper.table_rows import Found
@@ -24,7 +24,7 @@ def conditions(found: Found) -> str:
     return f"satisfied: ‖DJ‖ = {found['gradient_norm']:.0e}, smallest eigenvalue {found['smallest_eigenvalue']:.3g}"
 
 
-def complete(fit: Estimate) -> Estimate:
+def complete(fit: Fit) -> Fit:
     """Return the fit itself; raise KeyboardInterrupt if it was stopped before its end."""
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
@@ -47,7 +47,7 @@ def fit_log(reference: ReferenceSignal, start: tuple[float, ...], exact: FloatAr
     }
 
 
-def summary(fit: Estimate) -> dict[str, Any]:
+def summary(fit: Fit) -> dict[str, Any]:
     """Return the result of a fit, with the second-order sufficient conditions, as plain numbers."""
     smallest = certify(complete(fit), None).smallest_eigenvalue
     return {

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluation import evaluate
+from switchfit.fit.local_fit import fit_locally
 from switchfit.models.tyre_forces import MAGIC_FORMULA
 from switchfit.paper import figure_style, fit_summary, table_rows, tyre_logs, vehicle
 from switchfit.paper.figure_style import BLUE, DARK, LIGHT, PAGE, RED, tidy

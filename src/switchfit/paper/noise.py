@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.local_fit import fit_locally
+from switchfit.fit.local_fit import fit_locally
 from switchfit.paper import figure_style, fit_summary, table_rows, vehicle
 from switchfit.paper.figure_style import BLUE, DARK, PAGE, RED, SYMBOLS, tidy
 from switchfit.paper.informative_samples import POSITION_SIGMA, SAMPLES_LINE, compare_sample_sets

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from switchfit.arrays import FloatArray
+from switchfit.estimation.estimating import estimate
 from switchfit.paper import vehicle
 from switchfit.paper.table_rows import Found, Say, TableRow
 from switchfit.paper.vehicle import HORIZON
 from switchfit.runtime.errors import NotIntegrableError
-from switchfit.strategy.choice import estimate
 from switchfit.strategy.search import was_interrupted
 
 START_COUNT, QUICK_START_COUNT = 1000, 30

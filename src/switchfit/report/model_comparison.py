@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from switchfit.estimation.comparison import ModelComparison
 from switchfit.report.tables import Table, format_table, join_sections, wrap_text
 from switchfit.report.wording import join_words
 from switchfit.runtime.presentation import format_text
-from switchfit.strategy.comparison import ModelComparison
 
 _STRENGTHS = ((10.0, "very strong"), (6.0, "strong"), (2.0, "positive"), (0.0, "weak"))
 """Words of Kass and Raftery (1995) for differences in BIC."""

@@ -1,8 +1,8 @@
 """Dispatch of results to functions of rooms that come after their own.
 
-Results are data. How one is written or drawn, and how an estimate is validated with another run, is in later rooms,
-which register a function for each kind of result (`functools.singledispatch`): their ``__str__`` and ``plot`` call
-`format_text` and `draw_figure`, for which the modules of `switchfit.report` register functions. The report thus depends
+Results are data. How one is written or drawn is in a later room, which registers a function for each kind of result
+(`functools.singledispatch`): their ``__str__`` and ``plot`` call `format_text` and `draw_figure`, for which the modules
+of `switchfit.report` register functions. The report thus depends
 on the results, and no result depends on the report, which is imported when a result is first written or drawn. Settings
 are the keyword arguments of the registered function.
 """
@@ -56,21 +56,6 @@ def call_registered(dispatcher: _SingleDispatchCallable[Returned], result: objec
         name = default.__name__
         raise TypeError(f"{name} has no function for a {type(result).__name__}: register one with {name}.register.")
     return function(result, **settings)
-
-
-@singledispatch
-def validate_on(estimate: Any, other: Any, **settings: Any) -> Any:
-    """Return the validation of an estimate on another run.
-
-    Parameters
-    ----------
-    estimate : object
-        Of a kind that `switchfit.strategy.validation` has registered.
-    other : object
-    settings
-        Keyword arguments of the registered function.
-    """
-    return call_registered(validate_on, estimate, other=other, **settings)
 
 
 @singledispatch

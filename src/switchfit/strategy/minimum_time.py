@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
+from switchfit.fit.result import Fit
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.problem import Problem
 from switchfit.strategy.many_starts import MOST_STARTS, SAME_COST, Starts, try_starts
@@ -23,7 +23,7 @@ SAME_RATE = 1e-9
 """Relative difference of J from the time, or of its derivatives, that is rounding."""
 
 
-def is_minimum_time(problem: Problem, fit: Estimate) -> bool:
+def is_minimum_time(problem: Problem, fit: Fit) -> bool:
     """Return whether J is proportional to tf - t0, as it is at the start and at the end of a fit."""
     if len(problem.experiments) != 1 or not fit.history:
         return False
@@ -40,7 +40,7 @@ def is_minimum_time(problem: Problem, fit: Estimate) -> bool:
     return rate > 0 and proportional and bool(np.all(np.abs(others) <= SAME_RATE * rate))
 
 
-def try_shorter_horizons(problem: Problem, fit: Estimate) -> Starts:
+def try_shorter_horizons(problem: Problem, fit: Fit) -> Starts:
     """Return the lowest end of starts over shorter and shorter horizons, beginning with that of a fit.
 
     How many starts were tried and agree is that of the last horizon, over which none was better.

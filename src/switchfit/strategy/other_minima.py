@@ -8,7 +8,6 @@ from operator import itemgetter
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.search_record import Rival
 from switchfit.meshes.evaluator import evaluator_of
 from switchfit.meshes.follower import Follower
@@ -17,6 +16,7 @@ from switchfit.strategy.far_minima import find_far_minima
 from switchfit.strategy.hops import look_near
 from switchfit.strategy.short_fit import fit_briefly, is_lower
 from switchfit.strategy.time_limit import OutOfTimeError
+from switchfit.uncertainty.judged_fit import JudgedFit
 from switchfit.uncertainty.transition_profiles import compute_threshold
 
 logger = logging.getLogger("switchfit")
@@ -28,7 +28,7 @@ LEAST_GAIN_OF_MINIMUM = 0.1
 """By how much J has to be lower on another path for a fit: the data cannot tell less, and the model errs as much."""
 
 
-def find_other_minima(fit: Estimate) -> tuple[list[FloatArray], tuple[Rival, ...]]:
+def find_other_minima(fit: JudgedFit) -> tuple[list[FloatArray], tuple[Rival, ...]]:
     """Return starts at other minima that may be lower than the end of a good fit, the best first: in a transition time,
     or where the state meets corners in another way; and the minima in a time that the data do not tell from it.
     """

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.estimation.estimates import Estimate
 from switchfit.problem.data import count_from
 from switchfit.problem.dates import Dates
 from switchfit.problem.experiment import Experiment, show_time
@@ -15,14 +14,15 @@ from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.tables import list_columns
+from switchfit.uncertainty.judged_fit import JudgedFit
 
 
-def build_other_problem(estimate: Estimate, other: Any) -> Problem:
+def build_other_problem(estimate: JudgedFit, other: Any) -> Problem:
     """Return the problem of another run, in which the parameters of a fit begin at their fitted values, without priors.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     other : Experiment, list of Experiment, Problem, Measurements or Log
     """
     if isinstance(other, Problem):
@@ -43,7 +43,7 @@ def build_other_problem(estimate: Estimate, other: Any) -> Problem:
     return replace(given, experiments=runs, parameters=parameters)
 
 
-def _build_experiment(estimate: Estimate, problem: Problem, other: Any) -> Experiment:
+def _build_experiment(estimate: JudgedFit, problem: Problem, other: Any) -> Experiment:
     """Return the only experiment of a fit with the data of another log."""
     run, given = problem.experiments[0], list(other) if isinstance(other, (list, tuple)) else [other]
     items = run.measurements

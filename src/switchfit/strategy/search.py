@@ -17,8 +17,8 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.search_record import Rival, Step
+from switchfit.meshes.integration_error import LARGE_INTEGRATION_ERROR
 from switchfit.optimize import Status
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import get_first_line
@@ -31,7 +31,7 @@ from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.short_fit import End, fit_briefly, make_feasible
 from switchfit.strategy.stopping import is_doubted, is_enough, is_explained
 from switchfit.strategy.time_limit import OutOfTimeError, is_late
-from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
+from switchfit.uncertainty.judged_fit import JudgedFit
 
 logger = logging.getLogger("switchfit")
 Strategy = Literal["local", "auto", "thorough"]
@@ -67,7 +67,7 @@ def is_searching() -> bool:
     return Search.running > 0
 
 
-def was_interrupted(fit: Estimate) -> bool:
+def was_interrupted(fit: JudgedFit) -> bool:
     """Return whether Ctrl-C or a callback ended a fit, or the search that found it."""
     last = fit.steps[-1] if fit.steps else None
     searching = last is not None and "interrupted" in (last.strategy, last.ended)
@@ -79,10 +79,10 @@ class Search:
     """A search by several strategies in turn: the best fit so far, and a record of each step."""
 
     problem: Problem
-    best: Estimate | None
+    best: JudgedFit | None
     theta: FloatArray
     strategy: Strategy
-    fit: Callable[..., Estimate]
+    fit: Callable[..., JudgedFit]
     began: float
     line: Line
     others: Sequence[FloatArray] = ()
@@ -127,7 +127,7 @@ class Search:
         is_coarse = best is not None and not best.status.successful and best.integration_error > LARGE_INTEGRATION_ERROR
         return np.inf if best is None or best.violated or is_coarse or np.isnan(best.cost) else best.cost
 
-    def finish(self) -> Estimate:
+    def finish(self) -> JudgedFit:
         """Return the best fit with the record of the whole search."""
         best = self.best
         if best is None:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.data_variation import measure_variation
 from switchfit.fit.search_record import Step
 from switchfit.fit.statistics import count_priors, count_samples
@@ -18,6 +17,7 @@ from switchfit.strategy.known_order import explain_no_beam
 from switchfit.uncertainty.chi_square import CLEARLY_OFF, UNLIKELY_AS_NOISE, compare_with_sigma
 from switchfit.uncertainty.doubts import NEARLY_ALL
 from switchfit.uncertainty.issues import find_without_effect
+from switchfit.uncertainty.judged_fit import JudgedFit
 
 ADVISED_MORE_STARTS = "next: more starts"
 """Step that a verdict advises where the fit may be better elsewhere."""
@@ -27,7 +27,7 @@ DEEP = 10.0
 events reach 9.7; the times of a thermostat that switches five times in 40 samples begin at 59."""
 
 
-def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bool:
+def is_enough(problem: Problem, fit: JudgedFit, steps: Sequence[Step] = ()) -> bool:
     """Return whether nothing more has to be tried.
 
     Where the size of the noise is known, a right end leaves that noise. Where it is not, a minimum near the lowest may
@@ -37,7 +37,7 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
     Parameters
     ----------
     problem : Problem
-    fit : Estimate
+    fit : JudgedFit
         The best so far.
     steps : sequence of Step
         The fit from the first guess, and the searches since.
@@ -66,7 +66,7 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
     return steps[-1].cost == steps[-2].cost and not steps[-1].ended and not is_blind
 
 
-def _is_model_at_fault(problem: Problem, fit: Estimate) -> bool:
+def _is_model_at_fault(problem: Problem, fit: JudgedFit) -> bool:
     """Return whether what is doubted of a fit is how a function is written alone, from wherever the fit begins.
 
     Derivatives leave a switch out, also at the best end, and where there are none in the initial state, other starts
@@ -81,13 +81,13 @@ def _is_model_at_fault(problem: Problem, fit: Estimate) -> bool:
     return fit.status is Status.NONFINITE_START and is_known and fit.reason.figures.get("t", begins[0]) in begins
 
 
-def is_confirmed(problem: Problem, fit: Estimate) -> bool:
+def is_confirmed(problem: Problem, fit: JudgedFit) -> bool:
     """Return whether J alone says that nothing is in doubt, without a simulation of what was fitted.
 
     Parameters
     ----------
     problem : Problem
-    fit : Estimate
+    fit : JudgedFit
     """
     if fit.status is not Status.CONVERGED or fit.active or fit.idle or fit.integration_error > problem.rtol:
         return False
@@ -120,14 +120,14 @@ def _count_freedom(problem: Problem) -> int:
     return count_samples(problem) + count_priors(problem) - len(problem.theta_names)
 
 
-def is_shallow(problem: Problem, fit: Estimate) -> bool:
+def is_shallow(problem: Problem, fit: JudgedFit) -> bool:
     """Return whether chi-square may hide that a transition of a good fit is in the wrong place: J does not rise by a
     large multiple of what it hides before the time is half through the shorter mode beside it.
 
     Parameters
     ----------
     problem : Problem
-    fit : Estimate
+    fit : JudgedFit
     """
     freedom = _count_freedom(problem)
     if not (problem.is_sigma_known and problem.is_least_squares and freedom > 0):
@@ -144,11 +144,11 @@ def is_shallow(problem: Problem, fit: Estimate) -> bool:
     return False
 
 
-def is_doubted(fit: Estimate) -> bool:
+def is_doubted(fit: JudgedFit) -> bool:
     """Return whether a better end may be elsewhere, by what the verdict says.
 
     Parameters
     ----------
-    fit : Estimate
+    fit : JudgedFit
     """
     return not fit.status.successful or any(step.kind == ADVISED_MORE_STARTS for step in fit.verdict.next_steps)

@@ -29,7 +29,6 @@ from typing import Any
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.comparison import Comparison, compare
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
@@ -41,8 +40,8 @@ from switchfit.problem.validation.names import as_names
 from switchfit.problem.variants import fix_unknowns
 from switchfit.runtime import special
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import Displayed, Figure, draw_figure, format_line, join_first, validate_on
-from switchfit.strategy.choice import estimate as fit_problem
+from switchfit.runtime.presentation import Displayed, Figure, draw_figure, format_line, join_first
+from switchfit.strategy.choice import find_best_fit
 from switchfit.strategy.input_correlation import InputCorrelation, correlate_inputs
 from switchfit.strategy.other_run import build_other_problem
 from switchfit.strategy.whitening import whiten_residuals
@@ -51,6 +50,7 @@ from switchfit.uncertainty.corrected_errors import measure_widening
 from switchfit.uncertainty.doubts import Level
 from switchfit.uncertainty.explained_variance import HALF, explain_all, explain_channel
 from switchfit.uncertainty.findings import Finding
+from switchfit.uncertainty.judged_fit import JudgedFit
 from switchfit.uncertainty.prediction import Prediction, build_prediction
 from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose_runs, list_channels
 from switchfit.uncertainty.sample_derivatives import count_values_by_sigma
@@ -124,7 +124,7 @@ class Validation(Displayed):
     theta: FloatArray
     kept: tuple[str, ...]
     covariance: FloatArray = field(repr=False)
-    refit: Estimate | None = field(repr=False)
+    refit: JudgedFit | None = field(repr=False)
     run_names: tuple[str, ...]
     trajectories: tuple[Trajectory, ...] = field(repr=False)
     comparisons: tuple[tuple[Comparison, ...], ...] = field(repr=False)
@@ -253,13 +253,12 @@ def convert_to_percent(explained: float) -> float:
     return float(100 * (1 - np.sqrt(1 - explained)))
 
 
-@validate_on.register(Estimate)
-def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = None) -> Validation:
+def validate(estimate: JudgedFit, other: Any, *, refit: Sequence[str] | None = None) -> Validation:
     """Return how well the parameters of an estimate predict another run, see `Estimate.validate`.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     other : Experiment, list of Experiment, Problem, Measurements or Log
     refit : sequence of str, optional
     """
@@ -277,7 +276,7 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
     theta, found = problem.initial_theta, None
     if asked:
         held = [name for name in problem.theta_names if name not in asked]
-        found = fit_problem(fix_unknowns(problem, held))
+        found = find_best_fit(fix_unknowns(problem, held))
         theta[np.isin(problem.theta_names, found.theta_names)] = found.theta
     evaluator = Evaluator(problem, theta)
     trajectories, comparisons = compare(evaluator, theta)
@@ -312,7 +311,7 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
     )
 
 
-def _choose_noise(estimate: Estimate, problem: Problem) -> float:
+def _choose_noise(estimate: JudgedFit, problem: Problem) -> float:
     """Return what residuals are divided by where sigma is unknown: 1 where it is known, NaN where nothing says it."""
     if problem.is_sigma_known:
         return 1.0
@@ -320,7 +319,7 @@ def _choose_noise(estimate: Estimate, problem: Problem) -> float:
 
 
 def _judge_noise(
-    estimate: Estimate, problem: Problem, theta: FloatArray, covariance: FloatArray, refit: Estimate | None
+    estimate: JudgedFit, problem: Problem, theta: FloatArray, covariance: FloatArray, refit: JudgedFit | None
 ) -> tuple[float, float]:
     """Return the degrees of freedom with which the fit knows the noise, and by what chi-square is multiplied.
 

@@ -21,11 +21,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.comparison import Comparison
 from switchfit.fit.result import invert
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
+from switchfit.uncertainty.judged_fit import JudgedFit
 from switchfit.uncertainty.sample_derivatives import collect_sample_derivatives
 from switchfit.uncertainty.sensitivity import Sensitivity
 
@@ -34,12 +34,12 @@ NEGLIGIBLE_SINGULAR_VALUE = 1e-10
 
 
 def whiten_residuals(
-    estimate: Estimate,
+    estimate: JudgedFit,
     problem: Problem,
     sensitivities: Sequence[Sensitivity],
     comparisons: Sequence[Sequence[Comparison]],
     kept: Mapping[str, int],
-    refit: Estimate | None,
+    refit: JudgedFit | None,
     noise: float,
 ) -> tuple[list[list[FloatArray]], float, int, FloatArray]:
     """Return residuals without the correlation that the error of the parameters makes, and what follows from them.
@@ -50,7 +50,7 @@ def whiten_residuals(
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
         The fit.
     problem : Problem
         Of the other run.
@@ -58,7 +58,7 @@ def whiten_residuals(
     comparisons : sequence of sequences of Comparison, one for each experiment
     kept : mapping of str to int
         Unknowns that come from the fit, and where they are in theta of the other run.
-    refit : Estimate or None
+    refit : JudgedFit or None
         Estimation of the other unknowns.
     noise : float
         What residuals are divided by where sigma is unknown; 1 where it is known.
@@ -129,7 +129,7 @@ def _remove_error(
     return z, half - root @ (Q.T @ U), root @ root.T  # own unknowns follow the error of the parameters
 
 
-def _weigh_priors(problem: Problem, refit: Estimate) -> tuple[FloatArray, FloatArray]:
+def _weigh_priors(problem: Problem, refit: JudgedFit) -> tuple[FloatArray, FloatArray]:
     """Return the priors of own unknowns as further residuals: their derivatives (m, d), and their values (m,)."""
     where = np.flatnonzero(np.isin(problem.theta_names, refit.theta_names))
     priors = PriorTerms(*(values[where] for values in problem.unknowns.priors))

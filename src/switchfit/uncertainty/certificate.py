@@ -10,15 +10,13 @@ import numpy as np
 from switchfit.fit.result import Fit
 from switchfit.fit.termination import Kink
 from switchfit.meshes.evaluator import Evaluator
+from switchfit.meshes.integration_error import LARGE_INTEGRATION_ERROR
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import Printed
 from switchfit.uncertainty.derivative_check import UNCHECKED, DerivativeCheck, are_orders_right, compare_derivatives
 from switchfit.uncertainty.identification import analyse_solution
-
-LARGE_INTEGRATION_ERROR = 1e-6
-"""Relative change of J or of a constraint by halving the steps, above which it counts as inaccurate."""
 
 NEGATIVE_SCALED_EIGENVALUE = -1e-8
 """Eigenvalues of the scaled Hessian below this are negative curvature, not rounding."""

@@ -9,9 +9,9 @@ import numpy as np
 from switchfit.fit.result import Fit
 from switchfit.fit.scaled_hessian import moves_by_itself
 from switchfit.fit.termination import MOST_NAMED_UNKNOWNS
+from switchfit.meshes.integration_error import LARGE_INTEGRATION_ERROR
 from switchfit.problem.reads import name_whole_parameters
 from switchfit.runtime.issue import Issue
-from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.chi_square import UNLIKELY_AS_NOISE, compare_with_sigma
 from switchfit.uncertainty.covariance_comparison import disagreement
 from switchfit.uncertainty.doubts import BARELY_DETERMINED

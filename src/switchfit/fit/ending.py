@@ -9,10 +9,10 @@ import numpy as np
 from switchfit.fit.nonfinite_functions import explain_nonfinite
 from switchfit.fit.termination import Termination, termination_of
 from switchfit.meshes.evaluator import Evaluator
+from switchfit.meshes.integration_error import LARGE_INTEGRATION_ERROR
 from switchfit.optimize import Result, Status
 from switchfit.problem.comparisons import find_comparisons, find_cost_corner
 from switchfit.runtime.issue import Issue
-from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 
 PROBE_IN_STANDARD_ERRORS = 0.3
 """Change of an unknown, in standard errors with all others known, at which J is compared with what its Hessian says."""

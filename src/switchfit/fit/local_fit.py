@@ -14,10 +14,10 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.estimation.ending import describe_ending, find_undefined_function
-from switchfit.estimation.estimates import Estimate
-from switchfit.estimation.insignificance import drop_noise_of_times, is_within_error
+from switchfit.fit.ending import describe_ending, find_undefined_function
+from switchfit.fit.insignificance import drop_noise_of_times, is_within_error
 from switchfit.fit.minimization import minimize_cost
+from switchfit.fit.solved_fit import SolvedFit
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.meshes.follower import Follower
 from switchfit.meshes.halving import ORDER_OF_METHODS, refine_meshes, stabilize
@@ -48,7 +48,7 @@ def fit_locally(
     callback: Callable[[IterationRecord], object] | None = None,
     start: ArrayLike | None = None,
     first_cost: float = 0.0,
-) -> Estimate:
+) -> SolvedFit:
     """Fit a problem once from one start, as `estimate` does with ``strategy="local"``, with the same arguments.
 
     `first_cost` is J at the start of a search that ends with this fit: a large one is the scale of the integration
@@ -110,7 +110,7 @@ def fit_locally(
     ended = describe_ending(evaluator, result, earlier, error)
     if undefined := find_undefined_function(*(broken or (evaluator, result))):
         ended = replace(ended, reason=undefined)
-    found = Estimate(
+    found = SolvedFit(
         **vars(ended),
         **_describe(problem),
         **_describe_solution(evaluator, result, hessian),
@@ -135,7 +135,7 @@ def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
 
 
 def _describe_solution(evaluator: Evaluator, result: Result, hessian: HessianKind) -> dict[str, Any]:
-    """Return the fields of an Estimate at the solution: the exact Hessian even if the optimizer used another one.
+    """Return the fields of a fit at the solution: the exact Hessian even if the optimizer used another one.
 
     A model may be too sharp for an exact Hessian: see `Follower`.
     """
@@ -157,7 +157,7 @@ def _describe_solution(evaluator: Evaluator, result: Result, hessian: HessianKin
 
 @keep_with_problem
 def _describe(problem: Problem) -> dict[str, Any]:
-    """Return the fields of an Estimate that all fits of a problem share."""
+    """Return the fields of a fit that all fits of a problem share."""
     unknowns, parameters = problem.unknowns, problem.parameters
     counts = [len(run.transition_times) for run in problem.experiments]
     times = list(zip(unknowns.times, counts, strict=True))
