@@ -38,7 +38,7 @@ fuzz: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) -m fuzz
 
 coverage: $(VENV)/.installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/uncertainty/test_uncertainty.py tests/online/test_online_statistics.py -m slow -k "not unstable" -v -s
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/uncertainty/test_covariances.py tests/online/test_online_statistics.py -m slow -k "not unstable" -v -s
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -79,10 +79,12 @@ TOGETHER = ("test_adjoint", "test_machine_code", "test_prediction")
 """Files that share the programs of `systems.case`, which are most of what they take: one process runs them all."""
 
 BEGIN_FIRST = (
-    "batch docs losses_priors_delays both_engines several_runs free_final_time claims html_page zero_times_nan beam "
-    "insertion_rates modes named_inputs stiffness tutorial jumps commands strategy files docstrings "
-    "starts_benchmark matrix_exponentials random_systems intervals_of_many guards known_answers time_units "
-    "bootstrap examples estimate vehicles figures verdict dates modes_command"
+    "program simulated_runs multistart many_estimates chunks docs losses_priors_delays both_engines several_runs "
+    "free_final_time claims html_page zero_times_nan beam insertion_rates found_sequences verdicts_of_searches "
+    "searches_kept named_inputs stiffness tutorial jumps commands choice_of_strategies ends_of_searches known_order "
+    "many_starts hops other_minima files docstrings starts_benchmark closed_forms random_systems "
+    "intervals_of_many guards known_answers time_units bootstrap examples estimate refinement vehicles figures "
+    "verdict dates modes_command"
 )
 LONGEST = [*TOGETHER, *(f"test_{name}" for name in BEGIN_FIRST.split())]
 """Files that begin first, so that no process works alone for long at the end."""

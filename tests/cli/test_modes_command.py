@@ -99,9 +99,6 @@ def test_ctrl_c_keeps_the_best(folder, tmp_path, monkeypatch):
     assert (tmp_path / "best.toml").exists()
 
 
-# --- problem files ----------------------------------------------------------------------------------------------------
-
-
 def write_problem(folder, old, new=""):
     assert old in PROBLEM
     (folder / "changed.toml").write_text(PROBLEM.replace(old, new))

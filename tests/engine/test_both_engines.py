@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from support.models import decay, one_run, rest
 from support.swings import BOUNCE, DATA, GUARDS, MODES, MORE, PARAMETERS, RICH, problem, samples
 from switchfit.engine.native import program_cache
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
@@ -44,25 +43,6 @@ def test_derivatives_are_the_same(name, matrix):
     native, by_jax = both(given)
     for theta in (given.initial_theta, given.check_theta([1.2, 1.2, 1.3, 0.7, 0.8, 0.2])):
         assert_same(native(theta, matrix=matrix), by_jax(theta, matrix=matrix))
-
-
-def test_the_cost_of_transitions_in_closed_form():
-    """x = x0 exp(-k t): ``mu = (x - a)^2 + c t`` at tau, of which the other transition has nothing."""
-    modes = {"decay": decay, "stand": rest, "again": decay}
-    cost = sf.TransitionCost(lambda t, x, p: (x[0] - 0.4) ** 2 + 0.3 * t, after="stand")
-    given = one_run(sf.HybridSystem(modes, [1.0]), cost, ("decay", "stand", "again"), (0.8, 1.7), 3.0, {"k": 0.9})
-    evaluator, (tau, _, k) = evaluator_of(given), given.initial_theta
-    for method in ("auto", "forward"):
-        found = evaluator(given.initial_theta, method=method)
-        x = np.exp(-k * tau)
-        slope, bend = 2 * (x - 0.4), 2.0
-        assert found.cost == pytest.approx((x - 0.4) ** 2 + 0.3 * tau, rel=1e-8)
-        assert evaluator.cost(given.initial_theta) == pytest.approx(found.cost, rel=1e-12)
-        np.testing.assert_allclose(found.gradient, [-k * x * slope + 0.3, 0.0, -tau * x * slope], rtol=1e-7)
-        x_dd = x * np.array([[k**2, k * tau - 1], [k * tau - 1, tau**2]])
-        second = bend * x**2 * np.outer([k, tau], [k, tau]) + slope * x_dd
-        np.testing.assert_allclose(found.hessian[np.ix_([0, 2], [0, 2])], second, rtol=1e-6)
-        np.testing.assert_allclose(found.hessian[1], 0.0, atol=1e-12)
 
 
 def test_what_the_papers_equations_do_not_know_is_not_compared_with_them():

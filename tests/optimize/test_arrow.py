@@ -127,9 +127,6 @@ def test_curvature_beside_bounds_needs_no_full_matrix(monkeypatch):
     assert found.spectrum.smallest > 0.0 < expected.spectrum.smallest
 
 
-# --- the whole optimiser ----------------------------------------------------------------------------------------------
-
-
 BOX = box(np.full(11, -9.0), np.full(11, 9.0))
 
 

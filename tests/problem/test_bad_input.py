@@ -253,9 +253,6 @@ def test_results():
     refused(lambda: fit.trajectory, ValueError, "There are 2 experiments: use .trajectories[e]")
 
 
-# --- indices ----------------------------------------------------------------------------------------------------------
-
-
 def problem_of_two_states(mode):
     run = sf.Experiment(sf.Measurements(TIMES, np.zeros((5, 2)), sigma=0.1), ["m"], [])
     gains = sf.Parameter(np.ones((2, 3)), fixed=True)

@@ -8,44 +8,9 @@ import pytest
 
 import switchfit as sf
 from support import swings as protocol
-from support.derivatives import differentiate
 from support.models import decay, fit_problem, refused
-from switchfit.meshes.evaluator import evaluator_of
 
 COOLS = sf.HybridSystem({"cools": decay}, [1.0])
-
-
-def closed_problem(**settings):
-    """x' = a until tau, then x' = -k x until tf; J is the integral of x^2 + t, plus (x(tf) - 1/2)^2."""
-    system = sf.HybridSystem({"grow": lambda t, x, p: jnp.stack([p["a"] + 0 * t]), "decay": decay}, [0.1])
-    costs = [sf.RunningCost(lambda t, x, p: x[0] ** 2 + t), sf.TerminalCost(lambda x, p: (x[0] - 0.5) ** 2)]
-    run = sf.Experiment(costs, ("grow", "decay"), (0.9,), 0.0, sf.Parameter(2.3, lower=0.5, upper=6.0))
-    return sf.Problem(system, run, {"a": 1.2, "k": 0.7}, rtol=1e-12, atol=1e-14, **settings)
-
-
-def closed_cost(theta):
-    tau, tf, a, k = theta
-    grown = ((0.1 + a * tau) ** 3 - 0.1**3) / (3 * a)
-    top, rest = 0.1 + a * tau, tf - tau
-    return grown + top**2 * (1 - jnp.exp(-2 * k * rest)) / (2 * k) + tf**2 / 2 + (top * jnp.exp(-k * rest) - 0.5) ** 2
-
-
-@pytest.mark.parametrize(
-    ("method", "engine"),
-    [
-        ("auto", "native"),
-        ("adjoint", "jax"),
-        *(pytest.param(method, "jax", marks=pytest.mark.slow) for method in ("auto", "forward", "autodiff")),
-    ],
-)
-def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
-    problem = closed_problem(engine=engine)
-    assert problem.theta_names == ("tau_1", "tf", "a", "k")
-    expected = differentiate(closed_cost, problem.initial_theta)
-    found = evaluator_of(problem)(problem.initial_theta, method=method)
-    assert found.cost == pytest.approx(float(expected[0]), rel=1e-11)
-    np.testing.assert_allclose(found.gradient, expected[1], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.hessian, expected[2], rtol=0, atol=1e-8)
 
 
 def test_derivatives_pass_every_check():

@@ -10,6 +10,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import switchfit as sf
+from support.doses import ALL, AMOUNT, BODY, DOSES, GUESS, TIMES, TRUE, concentration, dose, make_log, make_problem
 from support.models import decay as eliminate
 from support.models import one_run, refused
 from switchfit.cli.summaries import summarize_estimate
@@ -17,48 +18,13 @@ from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.engine.native.library_places import places_in_library
 from switchfit.fit.collapsed_modes import idle_unknowns
 from switchfit.io.problem_file.loading import load_problem, read_experiments
-from switchfit.meshes.evaluator import Evaluator, evaluator_of
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.problem.functions import use_float64
 from switchfit.report.html.curves import collect_curves
 from switchfit.report.problem import write_experiments
 
-DOSES = np.array([0.0, 8.0, 16.0, 24.0])
-AMOUNT = 100.0
-TIMES = np.arange(0.0, 37.0)
-"""Four of the samples are at the times of doses: they are of the state before."""
-
-TRUE = {"k": 0.13, "V": 11.0}
-GUESS = {"k": 0.2, "V": sf.Parameter(8.0, lower=1.0)}
-
-
-def dose(t, x, p):
-    return x + AMOUNT / p["V"]
-
-
-BODY = sf.HybridSystem({"eliminate": eliminate}, [0.0], state_names=("c",))
-
-
-def concentration(k, V):
-    """c (K,), its slopes (K, 2) and curvatures (K, 2, 2) in k and V: a sum of decaying doses."""
-    since = TIMES[:, None] - DOSES
-    each = np.where(since > 0, AMOUNT / V * np.exp(-k * since), 0.0)
-    c, ck, ckk = each.sum(1), -(since * each).sum(1), (since**2 * each).sum(1)
-    slopes = np.stack([ck, -c / V], axis=1)
-    curvatures = np.stack([np.stack([ckk, -ck / V], 1), np.stack([-ck / V, 2 * c / V**2], 1)], 1)
-    return c, slopes, curvatures
-
-
-def make_log(values):
-    return sf.Measurements(TIMES, values, sigma=0.1)
-
-
-ALL = sf.Jump(DOSES, dose)
 WALL = sf.Jump("2024-05-01 16:00", dose)
 UNDEFINED = sf.Jump(1.0, lambda t, x, p: x / 0.0)
-
-
-def make_problem(values, jumps=ALL, **options):
-    return one_run(BODY, make_log(values), ["eliminate"], [], None, GUESS, time_unit="h", jumps=jumps, **options)
 
 
 @pytest.fixture(scope="module")
@@ -69,19 +35,6 @@ def values():
 @pytest.fixture(scope="module")
 def fit(values):
     return sf.estimate(make_problem(values))
-
-
-@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
-def test_cost_and_derivatives_are_those_of_the_closed_form(values, engine):
-    problem = make_problem(values, engine=engine, rtol=1e-11, atol=1e-13)
-    found = sf.evaluate(problem)
-    c, slopes, curvatures = concentration(0.2, 8.0)
-    r = (c - values) / 0.01
-    np.testing.assert_allclose(found.cost, 0.5 * r @ (c - values), rtol=1e-10)
-    np.testing.assert_allclose(found.gradient, r @ slopes, rtol=1e-9)
-    expected = slopes.T @ slopes / 0.01 + np.tensordot(r, curvatures, 1)
-    np.testing.assert_allclose(found.hessian, expected, rtol=1e-9)
-    assert evaluator_of(problem).engine.name == engine
 
 
 def test_fit_ends_where_least_squares_of_the_closed_form_ends(fit, values):

@@ -126,9 +126,6 @@ def test_the_report_says_what_nothing_reads(tmp_path):
     assert str(sf.Estimate.load(tmp_path / "fit.json").verdict) == str(fit.verdict)
 
 
-# --- comparisons with a parameter, with file and line -----------------------------------------------------------------
-
-
 def make_comparing(mode, observe=None, parameter_map=None, **others):
     times = np.linspace(0.1, 1.0, 5)
     log = sf.Measurements(times, times, sigma=1.0, observe=observe)

@@ -33,29 +33,43 @@ OPPOSITES: dict[type[ast.AST], tuple[str, str]] = {
 }
 
 NAMES = {
-    "batch": "batch intervals_of_many bootstrap many_logs verdicts_of_many starts_benchmark",
-    "cli": "commands modes_command saved_estimates experiment_design online_command first_problem many_logs",
-    "discretization": "rows_and_nodes hard_moments implicit_rows random_systems stiffness both_engines",
-    "engine": "corners rows_and_nodes stiffness following both_engines machine_code",
-    "engine/native": "machine_code both_engines random_systems beam implicit_rows operations functions_of_jax",
-    "estimation": "saved_estimates estimate saved_fits rows_and_nodes following bad_input hard_moments",
-    "experiment_design": "experiment_design",
-    "fit": "estimate jumps following finiteness starts_benchmark strategy guards verdict logarithmic_times",
+    "batch": "program simulated_runs multistart many_estimates chunks intervals_of_many bootstrap many_logs "
+    "verdicts_of_many starts_benchmark",
+    "cli": "commands modes_command saved_estimates information designs design_command online_command "
+    "first_problem many_logs",
+    "discretization": "rows_and_nodes hard_moments hidden_switches implicit_rows random_systems stiffness both_engines "
+    "closed_forms",
+    "engine": "closed_forms corner_branches corner_derivatives sliding paths_not_followed friction_and_tanks "
+    "corners_at_known_times rows_and_nodes stiffness following both_engines machine_code",
+    "engine/native": "machine_code both_engines closed_forms random_systems beam implicit_rows operations "
+    "functions_of_jax",
+    "estimation": "saved_estimates estimate refinement saved_fits rows_and_nodes following bad_input hard_moments "
+    "hidden_switches",
+    "experiment_design": "information designs design_command",
+    "fit": "estimate refinement jumps following finiteness closed_forms starts_benchmark "
+    "choice_of_strategies ends_of_searches known_order many_starts hops other_minima guards verdict "
+    "logarithmic_times",
     "io": "problem_files saved_estimates first_problem frames files many_logs",
     "io/logs": "text_logs log_formats time_units losses_priors_delays gps_drive dates",
     "io/problem_file": "problem_files first_problem files dates saved_estimates bad_input modes_command jumps",
     "models": "vehicles vehicle_mechanics",
-    "modes": "modes schedules insertion_rates",
-    "online": "online online_command",
-    "optimize": "sqp qp equalities arrow batch strategy several_runs",
-    "paper": "claims matrix_exponentials",
-    "problem": "bad_input cost_of_data corners dates numbers_given validation functions_of_jax finiteness "
-    "zero_times_nan",
-    "report": "online_report fit_report figures verdict frames modes validation numbers_given verdicts_of_many",
+    "modes": "found_sequences verdicts_of_searches searches_kept schedules insertion_rates",
+    "online": "tracking late_and_missing_samples alarms_and_budgets online_command",
+    "optimize": "sqp sqp_kinks sqp_endings qp equalities arrow program simulated_runs multistart many_estimates "
+    "chunks choice_of_strategies ends_of_searches known_order many_starts hops other_minima "
+    "several_runs",
+    "paper": "claims closed_forms",
+    "problem": "bad_input cost_of_data corner_branches corner_derivatives sliding paths_not_followed "
+    "friction_and_tanks corners_at_known_times dates numbers_given validation comparison "
+    "functions_of_jax finiteness zero_times_nan",
+    "report": "online_report fit_report figures verdict frames found_sequences verdicts_of_searches "
+    "searches_kept validation comparison numbers_given verdicts_of_many",
     "report/html": "html_page",
     "runtime": "progress saved_fits files threads bad_input",
-    "strategy": "validation strategy beam numbers_given starts_benchmark free_final_time",
-    "uncertainty": "uncertainty profiles prediction verdict validation",
+    "strategy": "validation comparison choice_of_strategies ends_of_searches known_order many_starts hops "
+    "other_minima beam numbers_given starts_benchmark free_final_time",
+    "uncertainty": "covariances identifiability residuals certificate profiles prediction verdict validation "
+    "comparison",
 }
 TESTS = {room: names.split() for room, names in NAMES.items()}
 """What must notice the mistakes of each room: files of tests, one after the other until something does."""

@@ -21,8 +21,14 @@ SOURCE = ROOT / "src" / "switchfit"
 PAPER, DESIGN, OPTIMIZE, ROWS = "paper_adjoint", "experiment_design", "optimize", "discretization"
 JAX, NATIVE, CORNERS, SPLIT = "engine/jax", "engine/native", "problem/corners", "engine/corners"
 
+
+def list_files(room: str, names: str) -> list[str]:
+    """Return the paths of files of tests from the root of the repository."""
+    return [f"tests/{room}/test_{name}.py" for name in names.split()]
+
+
 SYSTEMS = ["tests/engine/test_random_systems.py", "-k", "machine_code or each_engine"]
-PROTOCOL = ["tests/engine/test_both_engines.py"]
+PROTOCOL = list_files("engine", "both_engines closed_forms")
 FISHER = [*PROTOCOL, "-m", "slow or not slow", "-k", "derivatives_are_the_same and gauss"]
 TESTS = {
     "paper": [["tests/paper/test_adjoint.py"]],
@@ -32,27 +38,43 @@ TESTS = {
     "implicit": [
         ["tests/engine/test_implicit_rows.py", "-k", "differences or errors or converge or routine or order or pivots"]
     ],
-    "sqp": [["tests/optimize/test_sqp.py", "tests/optimize/test_qp.py"]],
+    "sqp": [list_files("optimize", "sqp sqp_kinks sqp_endings qp")],
     "equalities": [
         ["tests/optimize/test_equalities.py"],
         ["tests/problem/test_free_final_time.py", "-k", "hardly_depends"],
     ],
-    "beam": [["tests/strategy/test_strategy.py", "-k", "say"], ["tests/strategy/test_beam.py", "-k", "not jax"]],
-    "final time": [["tests/problem/test_free_final_time.py", "-k", "closed_form or every_check"]],
+    "beam": [["tests/strategy/test_known_order.py", "-k", "say"], ["tests/strategy/test_beam.py", "-k", "not jax"]],
+    "final time": [
+        ["tests/engine/test_closed_forms.py", "-k", "final"],
+        ["tests/problem/test_free_final_time.py", "-k", "every_check"],
+    ],
     "corners": [
+        ["tests/engine/test_closed_forms.py", "-k", "corners"],
         [
-            "tests/engine/test_corners.py",
+            *list_files("problem", "corner_branches corners_at_known_times"),
+            *list_files("engine", "corner_derivatives sliding paths_not_followed friction_and_tanks"),
             "-k",
-            "once or stays_on or what_slides or infinite_slope or leaves_out or closed_forms or differences or order "
+            "once or stays_on or what_slides or infinite_slope or leaves_out or differences or order "
             "or rest or play or sticks or predicts or level or filled or cascade or nearly_shuts or saturate "
             "or rounded or cases",
+        ],
+    ],
+    "online": [list_files("online", "tracking late_and_missing_samples alarms_and_budgets")],
+    "design": [[*list_files("experiment_design", "information designs"), *list_files("cli", "design_command")]],
+    "kinks": [
+        [*list_files("uncertainty", "covariances certificate identifiability residuals"), "-k", "kink or density"]
+    ],
+    "other minima": [
+        [
+            *list_files("strategy", "other_minima many_starts ends_of_searches choice_of_strategies known_order"),
+            "-k",
+            "minimum or minima or budget",
         ]
     ],
-    "online": [["tests/online/test_online.py"]],
-    "design": [["tests/experiment_design/test_experiment_design.py"]],
-    "kinks": [["tests/uncertainty/test_uncertainty.py", "-k", "kink or density"]],
-    "other minima": [["tests/strategy/test_strategy.py", "-k", "minimum or minima or budget"]],
-    "modes": [["tests/modes/test_schedules.py"], ["tests/modes/test_modes.py", "-m", "not slow"]],
+    "modes": [
+        ["tests/modes/test_schedules.py"],
+        [*list_files("modes", "found_sequences verdicts_of_searches searches_kept"), "-m", "not slow"],
+    ],
 }
 """What must notice the mistakes of each part that were thought of, one after the other until something does."""
 

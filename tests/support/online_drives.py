@@ -31,3 +31,16 @@ def vehicle(values: np.ndarray, modes: tuple[str, ...] = ("stick",), taus: tuple
 def track(modes: dict, start: list, data, parameters: dict, tf: float | None = None) -> sf.Problem:
     """Return the problem of a log that begins in the first mode."""
     return one_run(sf.HybridSystem(modes, start), data, (next(iter(modes)),), (), tf, parameters, name="log")
+
+
+def feed_all(online: sf.OnlineEstimator, log: np.ndarray, times: np.ndarray = TIMES) -> list[sf.Now]:
+    """Give a log to an estimator, as far as there are values."""
+    return [online.update(t, np.atleast_1d(y)) for t, y in zip(times, log, strict=False)]
+
+
+def assert_same(now: sf.Now, other: sf.Now) -> None:
+    """To the last bit."""
+    np.testing.assert_array_equal(now.best.theta, other.best.theta)
+    np.testing.assert_array_equal(now.transition_times, other.transition_times)
+    np.testing.assert_array_equal(now.covariance, other.covariance)
+    assert now.statistic == other.statistic

@@ -1,7 +1,6 @@
-"""Online estimation: against batch fits, closed forms and brute force."""
+"""Online estimation: drives, modes and parameters are followed, against batch fits and closed forms."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +8,18 @@ import pytest
 
 import switchfit as sf
 from support.models import decay, one_run, simulate_log
-from support.online_drives import MODES, SIGMA, SWITCHES, TIMES, measure, simulate, track, vehicle
+from support.online_drives import (
+    MODES,
+    SIGMA,
+    SWITCHES,
+    TIMES,
+    assert_same,
+    feed_all,
+    measure,
+    simulate,
+    track,
+    vehicle,
+)
 from switchfit.engine.hypotheses import Hypotheses
 from switchfit.models import skid_steer
 from switchfit.online.window_start import Past, Start, forget
@@ -29,11 +39,6 @@ def problem(log: np.ndarray) -> sf.Problem:
 def batch(log: np.ndarray) -> sf.Estimate:
     """The fit of all samples at once."""
     return sf.estimate(vehicle(log, MODES, SWITCHES))
-
-
-def feed_all(online: sf.OnlineEstimator, log: np.ndarray, times: np.ndarray = TIMES) -> list[sf.Now]:
-    """Give a log to an estimator, as far as there are values."""
-    return [online.update(t, np.atleast_1d(y)) for t, y in zip(times, log, strict=False)]
 
 
 # --- a drive ----------------------------------------------------------------------------------------------------------
@@ -178,14 +183,6 @@ def test_reset_begins_anew(problem, log):
     assert_same(again, first)
 
 
-def assert_same(now: sf.Now, other: sf.Now) -> None:
-    """To the last bit."""
-    np.testing.assert_array_equal(now.best.theta, other.best.theta)
-    np.testing.assert_array_equal(now.transition_times, other.transition_times)
-    np.testing.assert_array_equal(now.covariance, other.covariance)
-    assert now.statistic == other.statistic
-
-
 def test_a_window_gives_back_the_room_of_what_has_left(problem, log):
     large, small = (sf.OnlineEstimator(problem, window=4.0, capacity=capacity) for capacity in (4096, 95))
     assert_same(feed_all(small, log)[-1], feed_all(large, log)[-1])
@@ -227,211 +224,6 @@ def test_a_file_of_something_else_is_refused(problem, log, tmp_path):
     (tmp_path / "cut off").write_bytes((tmp_path / "state").read_bytes()[:100])
     with pytest.raises(ValueError, match="not a saved"):
         sf.OnlineEstimator.load(tmp_path / "cut off", problem)
-
-
-@pytest.mark.parametrize(("seed", "sigma"), [(20, 0.035), (1, 0.025)], ids=["moved far", "no time"])
-def test_alarms_by_noise_that_is_larger_than_sigma_are_refuted(seed, sigma):
-    """What is left without them is fitted anew, and no mode lasts less than no time."""
-    times, noise = np.arange(60.0), 0.05 * np.random.default_rng(seed).normal(size=60)
-    peak = 16.0 - 15.0 * np.exp(-np.minimum(times, 22.3) / 20.0)
-    levels = np.where(times < 22.3, peak, (peak + 2.0) * np.exp(-(times - 22.3) / 20.0) - 2.0) + noise
-    fields = {m: lambda t, x, p, m=m: (p[m] - x) / p["T"] for m in ("before", "after")}
-    data = sf.Measurements(times, levels, sigma=sigma)
-    run = sf.Experiment(data, ("before",), initial_state=[sf.Parameter(1.0)])
-    guesses = {"before": sf.Parameter(7.0), "after": sf.Parameter(0.8), "T": sf.Parameter(3.0, lower=0.1)}
-    log = sf.replay(sf.Problem(sf.HybridSystem(fields, [0.0]), run, guesses))
-    assert log.now.mode_sequence == ("before", "after")
-    assert log.now.since == pytest.approx(22.3, abs=0.1)
-
-
-@pytest.mark.parametrize("settings", [{}, {"window": 4.0}])
-@pytest.mark.parametrize("late", [3, 35])
-def test_samples_that_come_late_change_nothing_in_the_end(problem, log, batch, settings, late):
-    last = feed_all(sf.OnlineEstimator(problem, **settings), log)[-1]
-    online = sf.OnlineEstimator(problem, **settings)
-    order = sorted(range(len(log)), key=lambda k: k + (late + 0.5) * (k in (70, 100)) if k + late < len(log) else k)
-    for k in order:
-        now = online.update(TIMES[k], log[k])
-    assert now.mode_sequence == last.mode_sequence
-    away = (now.transition_times - last.transition_times) / last.time_errors
-    assert np.abs(away[1:]).max() < 0.02
-    assert np.abs(away[0]) < (0.02 if not settings else 1.0)  # it left the window before its late neighbours came
-    if not settings:
-        np.testing.assert_allclose(online.estimate().theta, batch.theta, rtol=1e-9)
-
-
-def test_missing_values_are_as_if_left_out(problem, log):
-    one, other = sf.OnlineEstimator(problem), sf.OnlineEstimator(problem)
-    holes = log.copy()
-    holes[::3, 1] = np.nan
-    holes[::7] = np.nan
-    for t, y in zip(TIMES, holes, strict=True):
-        a = one.update(t, y)
-        named = {name: v for name, v in zip(("X", "Y", "heading"), y, strict=True) if not np.isnan(v)}
-        b = other.update(t, named or None)
-    assert_same(a, b)
-
-
-def test_sensors_at_their_own_rates_with_a_delay():
-    """A slow sensor whose samples come 0.25 s late: each is put where the state was measured."""
-    rng = np.random.default_rng(1)
-    quick, slow = 0.1 * np.arange(1, 61), np.round(0.4 * np.arange(1, 15) + 0.25, 10)
-
-    def truth(t):
-        return np.where(t < 3.0, 1 - np.exp(-t), (1 - np.exp(-3.0)) * np.exp(3.0 - t))
-
-    a = sf.Measurements(quick, truth(quick) + 0.05 * rng.standard_normal(60), sigma=0.05, names=["a"])
-    b = sf.Measurements(slow, truth(slow - 0.25) + 0.01 * rng.standard_normal(14), sigma=0.01, names=["b"], delay=0.25)
-    system = sf.HybridSystem({"on": lambda t, x, p: p["k"] - x, "off": lambda t, x, p: -x}, [0.0])
-    problem = sf.Problem(system, sf.Experiment([a, b], ("on",), (), 0.0, 6.0), {"k": 1.2})
-    replayed = sf.replay(problem)
-    batch = sf.estimate(sf.Problem(system, sf.Experiment([a, b], ("on", "off"), (2.9,), 0.0, 6.0), {"k": 1.0}))
-    np.testing.assert_allclose(replayed.now.transition_times, batch.transition_times[0], atol=1e-4)
-    np.testing.assert_allclose(replayed.parameters["k"][-1], batch.parameters["k"], atol=1e-4)
-    assert len(replayed.times) == len(np.union1d(quick, slow))
-    online = sf.OnlineEstimator(problem)  # each sensor by itself, the slow one as soon as something else has come
-    for k, (t, y) in enumerate(zip(quick, a.values, strict=True)):
-        online.update(t, {"a": y[0]})
-        for seen, value in zip(slow, b.values, strict=True):
-            if k and quick[k - 1] < seen <= t:
-                now = online.update(seen, {"b": value[0]})
-    np.testing.assert_allclose(now.parameters["k"], batch.parameters["k"], atol=1e-4)
-    np.testing.assert_allclose(online.estimate().theta, batch.theta, rtol=1e-6)
-    assert 0 < replayed.delays([3.0])[0] < 0.6
-    assert replayed.latency()["p50"] > 0
-
-
-def test_inputs_that_are_held_are_those_of_the_batch(tmp_path):
-    rng, times = np.random.default_rng(2), 0.1 * np.arange(1, 41)
-    u = np.where(np.floor(times) % 2 == 0, 1.0, 3.0)
-    x, states = 0.0, []
-    for each in u:
-        x = each / 2 + (x - each / 2) * np.exp(-0.2)
-        states.append(x)
-    log = np.array(states) + 0.01 * rng.standard_normal(40)
-    system = sf.HybridSystem({"on": lambda t, x, p, u: u - p["k"] * x}, [0.0])
-    data = sf.Measurements(times, log, sigma=0.01)
-    known, unknown = sf.Input(np.append(0.0, times[:-1]), u), sf.Input([0.0], [0.0])
-    problem, later = (
-        sf.Problem(system, sf.Experiment(data, ("on",), (), 0.0, 4.0, inputs=inputs), {"k": 1.5})
-        for inputs in (known, unknown)
-    )
-    k = sf.estimate(problem).parameters["k"]
-    online = sf.OnlineEstimator(later)
-    online.update(0.0)
-    online.save(tmp_path / "state")
-    online.keep_journal(tmp_path / "journal")
-    online.update(times[0], [log[0]], u=u[0])
-    online.update(times[0] + 1e-9, None, u=u[1])
-    for t, y, held in zip(times[1:], log[1:], [*u[2:], u[-1]], strict=True):
-        now = online.update(t, [y], u=held)
-    np.testing.assert_allclose(now.parameters["k"], k, rtol=1e-5)
-    np.testing.assert_allclose(online.estimate().parameters["k"], k, rtol=1e-6)
-    loaded = sf.OnlineEstimator.load(tmp_path / "state", later)
-    loaded.keep_journal(tmp_path / "journal")
-    assert loaded.now.parameters["k"] == now.parameters["k"]
-    np.testing.assert_allclose(sf.replay(problem).now.parameters["k"], k, rtol=1e-5)  # the inputs of the problem
-
-
-# --- what is said -----------------------------------------------------------------------------------------------------
-
-
-def test_a_second_sensor_at_a_time_that_there_is():
-    """Its sample is put in by an update of its own."""
-    times = 0.1 * np.arange(1, 31)
-    values = np.exp(-times) + 0.01 * np.random.default_rng(0).standard_normal((2, 30))
-    sensors = [sf.Measurements(times, v, sigma=0.01, names=[n]) for v, n in zip(values, "ab", strict=True)]
-    problem = track({"on": decay}, [1.0], sensors, {"k": 0.7}, 3.0)
-    online = sf.OnlineEstimator(problem)
-    for t, y in zip(times, values.T, strict=True):
-        online.update(t, {"a": y[0]})
-        now = online.update(t, {"b": y[1]})
-    together = sf.replay(problem).now
-    np.testing.assert_allclose(now.parameters["k"], together.parameters["k"], rtol=1e-6)
-    np.testing.assert_allclose(now.standard_errors["k"], together.standard_errors["k"], rtol=1e-6)
-
-
-def test_an_alarm_that_later_samples_refute_is_retracted(problem, log):
-    online = sf.OnlineEstimator(problem, threshold=8.0)
-    wrong = log.copy()
-    wrong[40:44] -= [0.1, 0.1, 0.0]
-    said = feed_all(online, wrong[:58])
-    alarms, retracted = [now.alarm for now in said if now.alarm], [now.retracted for now in said if now.retracted]
-    assert retracted[0] == alarms[0]
-    assert said[-1].mode_sequence == ("stick",)
-    assert next(now for now in said if now.retracted).status is sf.OnlineStatus.RETRACTED
-
-
-@pytest.mark.parametrize("window", [None, 0.3])
-def test_a_model_that_cannot_be_simulated_any_more_is_said(window, tmp_path):
-    """x' = x^2 from 1 is infinite at t = 1."""
-    data = sf.Measurements([], np.empty((0, 1)), sigma=0.1)
-    modes = {"grow": lambda t, x, p: p["k"] * x**2, "more": lambda t, x, p: 2.0 * p["k"] * x**2}
-    parameters = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 1e-6))}
-    problem = track(modes, [1.0], data, parameters)
-    online = sf.OnlineEstimator(problem, window=window)
-    for k in range(1, 9):
-        online.update(0.1 * k, [1 / (1 - 0.1 * k)])
-    for t in (2.0, 2.1):
-        with pytest.raises(ValueError, match=r"the model cannot be simulated from t = .*begin anew with reset\(\)"):
-            online.update(t, [10.0])
-        assert online.now.status is sf.OnlineStatus.STOPPED
-    with pytest.raises(ValueError, match="the model cannot be simulated"):
-        online.save(tmp_path / "state")
-    online.reset()
-    assert online.update(0.1, [1 / 0.9]).status is sf.OnlineStatus.TRACKING
-
-
-def test_a_budget_leaves_out_work_and_says_so(problem, log):
-    online = sf.OnlineEstimator(problem, budget=1e-7)
-    said = feed_all(online, log)
-    count = [now.status for now in said].count
-    assert count(sf.OnlineStatus.OVERRUN) > 50
-    assert count(sf.OnlineStatus.OVERRUN) + count(sf.OnlineStatus.LOST) > 100  # without births no change is seen
-
-
-def test_a_model_that_has_lost_the_samples_stays_so():
-    """The parameter goes where each later sample is near again; those before are still not explained."""
-    times = 0.1 * np.arange(1, 101)
-    noise = 0.1 * np.random.default_rng(0).standard_normal(100)
-    log = np.where(times < 3, 1 - np.exp(-0.7 * times), (1 - np.exp(-2.1)) * np.exp(-0.7 * (times - 3))) / 0.7 + noise
-    modes = {"rise": lambda t, x, p: 1 - p["k"] * x, "fall": lambda t, x, p: -p["k"] * x}
-    data = sf.Measurements(times, log, sigma=0.1)
-    problem = track(modes, [0.0], data, {"k": sf.Parameter(0.7, lower=0.01)}, 10.0)
-    said = sf.replay(problem, successions={"rise": ()}).status
-    first = said.index(sf.OnlineStatus.LOST)
-    assert set(said[first:]) == {sf.OnlineStatus.LOST}
-    assert sf.OnlineStatus.LOST not in sf.replay(problem).status  # with the mode that explains them
-
-
-def test_a_threshold_is_set_after_calibration(problem):
-    online = sf.OnlineEstimator(problem)
-    found, rarer = (sf.calibrate(online, rate, seconds=3.0, runs=10) for rate in (0.01, 0.0001))
-    assert 0 < found.threshold < min(rarer.threshold, 40)
-    assert "10 runs" in str(found)
-    online.set_threshold(found.threshold)
-    assert online.threshold == found.threshold
-
-
-BAD_SAMPLES = {
-    "too many": (1.0, [0.0, 0.0], "must have 3 values"),
-    "infinite": (1.0, [np.inf, 0.0, 0.0], "must be finite"),
-    "unknown": (1.0, {"Z": 1.0}, "no channel"),
-    "sensor": (1.0, {3: [1.0]}, "the position of a sensor must lie in 0..0"),
-    "twice": (0.1, [0.0, 0.0, 0.0], "two samples"),
-    "early": (-0.1, [0.0, 0.0, 0.0], "too late"),
-    "time": (np.nan, [0.0, 0.0, 0.0], "t must"),
-}
-
-
-@pytest.mark.parametrize(("t", "y", "message"), BAD_SAMPLES.values(), ids=BAD_SAMPLES)
-def test_bad_samples_are_refused_and_change_nothing(problem, log, t, y, message):
-    online = sf.OnlineEstimator(problem)
-    first = online.update(0.1, log[0])
-    with pytest.raises(ValueError, match=message):
-        online.update(t, y)
-    assert online.now is first
-    assert online.update(0.2, log[1]).time == 0.2
 
 
 def test_bad_settings_are_refused(problem, log):
@@ -518,23 +310,6 @@ def test_a_parameter_with_a_new_value_is_joined_to_its_old_one(variance):
         value = found.cost + found.gradient @ there + 0.5 * there @ found.matrix @ there
         assert value == pytest.approx(cost, rel=1e-9)
         np.testing.assert_allclose(np.append(d[:2], d[3]) @ turn, e, atol=1e-9)
-
-
-def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
-    """Maxima of 20 s of alarms at the rate exp(-(h - 5) / 2) / s: for one an hour, h = 5 + 2 log(3600)."""
-    from switchfit.online import calibration
-
-    rng = np.random.default_rng(0)
-    drawn = iter(5 + 2 * (np.log(20) - np.log(rng.exponential(size=4000))))
-
-    def update(t, y=None):
-        return SimpleNamespace(status=sf.OnlineStatus.TRACKING, statistic=next(drawn))
-
-    quiet = SimpleNamespace(reset=lambda: None, update=update)
-    monkeypatch.setattr(sf.OnlineEstimator, "build_like", lambda online, problem, threshold: quiet)
-    monkeypatch.setattr(calibration, "list_updates", lambda noisy: [(0.0, {})])
-    found = sf.calibrate(sf.OnlineEstimator(problem), 1 / 3600, runs=4000)
-    assert found.threshold == pytest.approx(5 + 2 * np.log(3600), abs=0.5)  # 1.8 more without the factor
 
 
 @pytest.mark.parametrize("seed", [0, 1])

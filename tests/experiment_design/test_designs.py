@@ -1,8 +1,6 @@
-"""Experiment design: information, criteria, samples, sensors and inputs, against closed forms and brute force."""
+"""Designs of samples, sensors and inputs, against closed forms and brute force; what is refused."""
 
-import csv
 import json
-import tomllib
 from dataclasses import replace
 from itertools import combinations, product
 
@@ -11,50 +9,21 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from support.commands import catch_settings, run
-from support.models import STILL, curve, decay, first_state, refused
+from support.designs import TIMES, lag, line, line_information, planned
+from support.models import STILL, decay, refused
 from switchfit.experiment_design.input_search import _describe, differentiate_criterion
 from switchfit.experiment_design.inputs import replace_inputs, stack_inputs
 from switchfit.experiment_design.nominal import Nominal, simulate_values
 from switchfit.experiment_design.samples import Candidates, choose_samples
 from switchfit.experiment_design.search import _build_criterion
-from switchfit.io.problem_file.loading import load_problem
 from switchfit.meshes.evaluator import Evaluator
-from switchfit.models import heater_problem
 from switchfit.problem.functions import use_float64
-
-TIMES = np.linspace(0.0, 4.0, 9)
-
-
-def planned(times, channels=1, **settings):
-    """Samples that are not made yet."""
-    return sf.Measurements(times, np.zeros((len(times), channels)), **({"sigma": 0.1} | settings))
-
-
-def line(times=TIMES, parameters=None, **settings):
-    """a + b t, with a = 1 and b = 2."""
-    data = planned(times, observe=lambda t, x, p: jnp.stack([p["a"] + p["b"] * t]), **settings)
-    return sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), {"a": 1.0, "b": 2.0} | (parameters or {}))
-
-
-def line_information(times, sigma=0.1):
-    slopes = np.stack([np.ones(len(times)), times])
-    return slopes @ slopes.T / sigma**2
 
 
 def decaying(times, **parameters):
     """x = start exp(-k t), with k = 0.5."""
     system = sf.HybridSystem({"decay": decay}, lambda p: jnp.stack([p["start"]]))
     return sf.Problem(system, sf.Experiment(planned(times), ("decay",), (), 0.0, 8.0), {"k": 0.5} | parameters)
-
-
-def lag(values, *, kind="hold", parameters=None, data=None, **settings):
-    """x' = -k x + b u, y = x, u at knots."""
-    system = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * x + p["b"] * u}, [0.0])
-    knots = np.linspace(0.0, 4.0, len(values) + (kind == "hold"))[: len(values)]
-    data = planned(TIMES[1:], **(data or {}))
-    run = sf.Experiment(data, ("on",), (), 0.0, 4.0, inputs=sf.Input(knots, values, kind=kind))
-    return sf.Problem(system, run, {"k": 0.7, "b": 2.0} | (parameters or {}), **settings)
 
 
 def two_lags():
@@ -72,93 +41,6 @@ def transitions_at_knots():
     system = sf.HybridSystem({"slow": one.system.modes["on"], "fast": fast}, [0.0])
     run = replace(one.experiments[0], mode_sequence=("slow", "fast", "slow"), transition_times=(1.0, 3.0))
     return sf.Problem(system, run, {"k": 0.7, "b": 2.0})
-
-
-# Information
-
-
-def test_information_of_a_line_does_not_depend_on_values_but_on_missing_ones():
-    problem = line()
-    (data,) = problem.experiments[0].data
-    values = np.random.default_rng(0).normal(size=(9, 1))
-    values[2] = np.nan
-    plan = sf.design(replace(problem, experiments=replace(problem.experiments[0], data=replace(data, values=values))))
-    np.testing.assert_allclose(plan.covariance, np.linalg.inv(line_information(np.delete(TIMES, 2))), rtol=1e-12)
-    np.testing.assert_allclose(plan.standard_errors**2, np.diag(plan.covariance))
-    assert plan.criterion_after == pytest.approx(np.log(np.linalg.det(plan.covariance)), abs=1e-12)
-    assert plan.criterion_before == plan.criterion_after
-
-
-def test_priors_and_other_runs_are_information():
-    problem = line()
-    first = replace(problem.experiments[0], name="first")
-    second = replace(first, name="second", data=planned(TIMES[:3], observe=first.data[0].observe, sigma=0.2))
-    parameters = {"a": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.05)), "b": 2.0}
-    plan = sf.design(sf.Problem(STILL, [first, second], parameters), samples=2)
-    assert plan.run == "second"
-    (times,) = plan.sample_times.values()
-    F = line_information(TIMES) + line_information(times, 0.2) + np.diag([0.05**-2.0, 0.0])
-    others = F - line_information(times, 0.2)
-    choices = combinations(TIMES[:3], 2)
-    best = max(choices, key=lambda pair: np.linalg.det(others + line_information(np.array(pair), 0.2)))
-    np.testing.assert_array_equal(times, best)  # 0 and 0.5; without all else it would be 0 and 1
-    np.testing.assert_allclose(plan.covariance, np.linalg.inv(F), rtol=1e-10)
-    assert len(plan.problem.experiments[0].data[0].times) == 9
-
-
-def test_a_sigma_that_is_a_parameter_and_a_robust_loss():
-    """The loss counts as normal noise."""
-    plan = sf.design(line(sigma="noise", parameters={"noise": sf.Parameter(0.1, lower=0.01)}))
-    np.testing.assert_allclose(plan.covariance[:2, :2], np.linalg.inv(line_information(TIMES)), rtol=1e-10)
-    assert plan.standard_errors[2] == pytest.approx(0.1 / np.sqrt(2 * 9), rel=1e-10)
-    np.testing.assert_allclose(sf.design(line(loss="huber")).covariance, plan.covariance[:2, :2], rtol=1e-9)
-
-
-def test_guarded_times_are_no_unknowns_of_their_own():
-    """The covariance is that of the parameters, and of guarded times as functions of them."""
-    fall = {"air": lambda t, x, p: jnp.stack([x[1], -p["g"] + 0.0 * x[0]])}
-    bounce = {("air", "air"): lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])}
-    system = sf.HybridSystem(fall, [1.0, 0.0], bounce, guards={("air", "air"): lambda t, x, p: x[0]})
-    data = planned(np.linspace(0.1, 1.5, 15), observe=first_state, sigma=0.01)
-    problem = sf.Problem(system, sf.Experiment(data, ("air", "air"), (0.5,), 0.0, 1.5), {"g": 9.8, "e": 0.8})
-    plan = sf.design(problem)
-    exact = sf.evaluate_on_guards(plan.problem, plan.theta)
-    np.testing.assert_allclose(plan.covariance[1:, 1:], np.linalg.inv(exact.hessian), rtol=1e-6)
-    of_time = exact.times_slope @ np.linalg.inv(exact.hessian) @ exact.times_slope.T
-    assert plan.standard_errors[0] ** 2 == pytest.approx(of_time.item(), rel=1e-6)
-    assert plan.theta[0] == pytest.approx(np.sqrt(2 / 9.8), rel=1e-6)
-    assert sf.design(problem, samples=3, names=["g", "e"]).undetermined == ()
-
-
-def test_what_cannot_be_determined_is_named():
-    still = lag(np.zeros(4))
-    plan = sf.design(still)
-    assert plan.undetermined == ("k", "b")
-    assert np.isinf(plan.criterion_after)
-    assert "cannot determine k, b" in " ".join(str(plan).split())
-    moved = sf.design(still, free={"u": (-1.0, 1.0)})
-    assert moved.undetermined == ()
-    assert np.isinf(moved.criterion_before)
-    assert np.isfinite(moved.criterion_after)
-    of_product, guess = (lambda t, x, p: jnp.stack([p["a"] * p["b"] * t])), {"a": 1.0, "b": 2.0}
-    assert sf.design(curve(of_product, TIMES, TIMES, guess, tf=4.0, sigma=1.0)).undetermined == ("a", "b")
-
-
-def test_a_transition_at_a_sample_counts_half_from_each_side():
-    near = [sf.design(heater_problem(), [2.0 + step, 0.5]) for step in (-1e-7, 0.0, 1e-7)]
-    before, at, after = (np.linalg.inv(plan.covariance) for plan in near)
-    assert abs(before[0, 0] - after[0, 0]) > 0.2 * at[0, 0]
-    np.testing.assert_allclose(at, 0.5 * (before + after), rtol=1e-5)
-
-
-def test_standard_errors_beyond_the_next_transition_are_doubtful():
-    assert sf.design(heater_problem(), samples=4).doubtful == ()
-    problem = heater_problem()
-    late = planned([4.0, 5.0], sigma=3.0, names=("thermometer",))
-    plan = sf.design(replace(problem, experiments=replace(problem.experiments[0], data=late)), names="k")
-    assert plan.standard_errors[0] > 2.0
-    assert plan.doubtful == ("tau_1", "k")
-    assert "The standard error of tau_1, k is larger than the distance to a bound" in " ".join(str(plan).split())
 
 
 # Samples and sensors
@@ -399,90 +281,3 @@ test_problems_that_cannot_be_designed = refused(
     (lambda: sf.design(replace(ONE, system=CORNER), free={"u": (0.0, 1.0)}), "free cannot be used where"),
     error=ValueError,
 )
-
-
-# --- `switchfit design`, and [design] in problem files ----------------------------------------------------------------
-
-
-MODEL = """
-import switchfit as sf
-def heat(t, x, p, u):
-    return p["b"] * u["power"] + u["sun"] - p["k"] * x
-system = sf.HybridSystem({"heat": heat}, [0.0], state_names=("T",))
-"""
-
-PROBLEM = """
-model = "model.py:system"
-[parameters]
-k = { value = 0.5, lower = 0.0 }
-b = 2.0
-[[experiments]]
-mode_sequence = ["heat"]
-inputs = { file = "plan.csv", columns = { power = "power", sun = "sun" } }
-[[experiments.data]]
-file = "plan.csv"
-columns = ["T"]
-sigma = 0.1
-"""
-
-DESIGN = """
-[design]
-criterion = "A"
-samples = { T = 3 }
-sensors = { T = 1.0 }
-budget = 2.0
-starts = 0
-names = { k = 0.1, b = 0.5 }
-free = { power = [0.0, 1.5] }
-"""
-
-
-@pytest.fixture
-def folder(tmp_path):
-    (tmp_path / "model.py").write_text(MODEL)
-    (tmp_path / "problem.toml").write_text(PROBLEM + DESIGN)
-    (tmp_path / "plain.toml").write_text(PROBLEM)
-    rows = [f"{t},0,1.0,0.2" for t in np.linspace(0.0, 4.0, 9)]
-    (tmp_path / "plan.csv").write_text("\n".join(["t,T,power,sun", *rows]) + "\n")
-    return tmp_path
-
-
-def test_a_design_is_printed_and_written(folder):
-    out = folder / "out" / "deep"
-    result = run("design", folder / "problem.toml", "--out", out, code=0)
-    assert result.stdout.startswith("A-optimal design of run1 for k, b.\n")
-    names = ["design.json", "design.png", "design.txt", "input.csv", "samples.csv"]
-    assert sorted(path.name for path in out.iterdir()) == names
-    assert (out / "design.txt").read_text() == result.stdout
-    problem = load_problem(folder / "problem.toml").problem
-    plan = sf.design(problem, **tomllib.loads(DESIGN)["design"])
-    assert str(plan) == result.stdout.rstrip("\n")
-    np.testing.assert_array_equal(sf.read_log(out / "input.csv")["power"], plan.inputs["power"])
-    np.testing.assert_array_equal(sf.read_log(out / "input.csv").times, np.linspace(0.0, 4.0, 9))
-    rows = list(csv.DictReader((out / "samples.csv").read_text().splitlines()))
-    assert {row["sensor"] for row in rows} == {"T"}
-    np.testing.assert_array_equal([float(row["t"]) for row in rows], plan.sample_times["T"])
-    saved = json.loads((out / "design.json").read_text())["design"]
-    assert saved["sample_times"]["T"] == plan.sample_times["T"].tolist()
-
-
-def test_options_override_the_file(folder, monkeypatch):
-    given = catch_settings(monkeypatch, "design")
-    result = run("design", folder / "plain.toml", "--criterion", "E", "--samples", 5)
-    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
-    assert given == {"criterion": "E", "samples": 5}
-    run("design", folder / "problem.toml", "--criterion", "D")
-    assert (given["criterion"], given["samples"], given["budget"]) == ("D", {"T": 3}, 2.0)
-
-
-def test_json_and_what_cannot_be_estimated(folder):
-    (folder / "plan.csv").write_text((folder / "plan.csv").read_text().replace("1.0,0.2", "0.0,0.0"))
-    result = run("design", folder / "plain.toml", "--json", code=1)
-    assert "k, b cannot be estimated from such an experiment" in result.stderr
-    shown = json.loads(result.stdout)
-    assert (shown["theta_names"], shown["covariance"]) == (["k", "b"], [[None, None], [None, None]])
-
-
-def test_a_mistake_in_the_file_is_said_with_its_key(folder):
-    (folder / "problem.toml").write_text((PROBLEM + DESIGN).replace('criterion = "A"', 'criterion = "T"'))
-    assert "design.criterion" in run("design", folder / "problem.toml", code=2).stderr
