@@ -54,32 +54,32 @@ bench: $(VENV)/.installed-bench
 
 starts: $(VENV)/.installed-bench
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks starts --methods exact,local,auto --processes $(JOBS)
-	cp $$(ls -t benchmarks/results/starts-*.md | head -1) docs/starts-results.md
+	cp $$(ls -t benchmarks/results/starts-*.md | head -1) docs/measured/starts.md
 
 modes: $(VENV)/.installed-bench
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks modes --peers --processes $(JOBS)
-	cp benchmarks/results/modes.md docs/modes-results.md
+	cp benchmarks/results/modes.md docs/measured/modes.md
 
 harm: $(VENV)/.installed-bench
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks harm
-	cp benchmarks/results/harm.md docs/harm-results.md
+	cp benchmarks/results/harm.md docs/measured/harm.md
 
 sharp: $(VENV)/.installed-bench
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks sharp
-	cp benchmarks/results/sharp.md docs/sharp-results.md
+	cp benchmarks/results/sharp.md docs/measured/sharp.md
 
 online: $(VENV)/.installed-bench
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks online
-	cp benchmarks/results/online.md docs/online-results.md
+	cp benchmarks/results/online.md docs/measured/online.md
 
 speed: bench
-	cp benchmarks/results/full.md docs/speed-results.md
-	cp benchmarks/results/full.json docs/speed-results.json
+	cp benchmarks/results/full.md docs/measured/speed.md
+	cp benchmarks/results/full.json docs/measured/speed.json
 
 paper: $(VENV)/.installed
 	$(BIN)/switchfit paper --out out/paper
-	cp out/paper/table.md docs/paper-results.md
-	cp out/paper/results.json docs/paper-results.json
+	cp out/paper/table.md docs/measured/paper.md
+	cp out/paper/results.json docs/measured/paper.json
 
 release-check: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest tests/house/test_release.py -m "slow or not slow" -s

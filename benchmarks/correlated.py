@@ -2,7 +2,7 @@
 
 Polynomials with d coefficients are fitted to noise of a first-order autoregressive process, in closed form, and their
 residuals are judged as `switchfit.uncertainty.residuals` does it. ``python -m benchmarks.correlated [RUNS]`` prints the
-table of ``docs/correlated-results.md``: in brackets with the bias that `correct_correlation` removes.
+table of ``docs/measured/correlated.md``: in brackets with the bias that `correct_correlation` removes.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A state rests at 0 and rises to 1 with the time constant 1/8 s from tau on; it is sampled every 0.1 s, so that most of
 what is known about tau comes from the one or two samples after it. ``python benchmarks/coverage.py [RUNS]`` prints the
-table of ``docs/coverage-results.md``.
+table of ``docs/measured/coverage.md``.
 
 The last column is computed apart, without switchfit: the region where twice the rise of the profile stays below the
 quantile of chi², from the solution in closed form on a grid of tau and k. It is what the likelihood ratio can do.

@@ -2,7 +2,7 @@
 
 A line is fitted to noise of several kinds, by iterated weights and without switchfit. The losses have the scales of
 sigma = 1, which is right for most of the noise but for the last kind. ``python -m benchmarks.robust [RUNS]`` prints
-the table of ``docs/robust-results.md``.
+the table of ``docs/measured/robust.md``.
 """
 
 from __future__ import annotations

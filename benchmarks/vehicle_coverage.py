@@ -1,7 +1,7 @@
 """How often the 95 % intervals of each built-in model hold the truth.
 
 Each case simulates logs of one model at a truth, adds the noise of its sensors, and fits every log from one guess that
-is off. ``python benchmarks/vehicle_coverage.py [RUNS]`` writes ``docs/vehicle-coverage-results.md``, which
+is off. ``python benchmarks/vehicle_coverage.py [RUNS]`` writes ``docs/measured/vehicle-coverage.md``, which
 ``docs/measured.md`` includes; ``python benchmarks/vehicle_coverage.py 200 bicycle lugre`` prints the rows of some cases
 alone.
 """
@@ -25,7 +25,7 @@ RUNS = 200
 FEW = 40
 """Logs of the cases in `SLOW`, whose modes are too long for machine code."""
 SLOW = ("magic_formula, loads",)
-PAGE = Path(__file__).parent.parent / "docs" / "vehicle-coverage-results.md"
+PAGE = Path(__file__).parent.parent / "docs" / "measured" / "vehicle-coverage.md"
 FAR = 5.0
 """Standard errors from the truth beyond which a fit has ended elsewhere."""
 POSE = (0, 2, 4)

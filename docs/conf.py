@@ -11,7 +11,7 @@ import key_pages
 from sphinx.application import Sphinx
 
 HERE = Path(__file__).parent
-SOURCES = [*HERE.glob("*-results.*"), *HERE.parent.glob("src/**/*.py")]
+SOURCES = [*HERE.glob("measured/*"), *HERE.parent.glob("src/**/*.py")]
 SOURCES += [*HERE.parent.glob("examples/**/*.py"), *HERE.parent.glob("examples/**/*.csv")]
 """What figures are made from: the library, the examples, stored results."""
 
@@ -45,18 +45,7 @@ extensions = [
     "sphinx_design",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-INCLUDED = [
-    "correlated-results.md",
-    "robust-results.md",
-    "coverage-results.md",
-    "harm-results.md",
-    "online-results.md",
-    "modes-results.md",
-    "paper-results.md",
-    "sharp-results.md",
-    "starts-results.md",
-    "vehicle-coverage-results.md",
-]
+INCLUDED = [f"measured/{table.name}" for table in HERE.glob("measured/*.md") if table.stem != "speed"]
 """Tables that other pages include; they are no pages themselves."""
 exclude_patterns = ["_build", "_generated", *INCLUDED]
 templates_path = ["_templates"]

@@ -1,4 +1,4 @@
-"""The figures of the page on the paper, from docs/paper-results.json; the documentation draws them when it is built."""
+"""The figures of the page on the paper, from docs/measured/paper.json; the documentation draws them when it is built."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ HERE = Path(__file__).parent
 
 def draw(folder: Path) -> None:
     """Write every figure as SVG."""
-    results = json.loads((HERE / "paper-results.json").read_text(encoding="utf-8"))
+    results = json.loads((HERE / "measured" / "paper.json").read_text(encoding="utf-8"))
     folder.mkdir(exist_ok=True)
     for name, entry in results.items():
         for title, figure in PARTS[name].draw(entry["found"]).items():

@@ -1,4 +1,4 @@
-"""The pictures of the page on speed, from docs/speed-results.json; the documentation draws them when it is built."""
+"""The pictures of the page on speed, from docs/measured/speed.json; the documentation draws them when it is built."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ METHODS = {
 
 def draw(folder: Path) -> None:
     """Write peers.svg and growth.svg."""
-    results = json.loads((HERE / "speed-results.json").read_text(encoding="utf-8"))
+    results = json.loads((HERE / "measured" / "speed.json").read_text(encoding="utf-8"))
     folder.mkdir(exist_ok=True)
     peers(results).savefig(folder / "peers.svg")
     growth(results).savefig(folder / "growth.svg")

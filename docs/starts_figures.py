@@ -1,4 +1,4 @@
-"""The picture of poor first guesses on the page of figures measured, from the table in docs/starts-results.md."""
+"""The picture of poor first guesses on the page of figures measured, from the table in docs/measured/starts.md."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAMES = {
 def draw(folder: Path) -> None:
     """Write starts.svg."""
     folder.mkdir(exist_ok=True)
-    shares = read_shares((HERE / "starts-results.md").read_text(encoding="utf-8"))
+    shares = read_shares((HERE / "measured" / "starts.md").read_text(encoding="utf-8"))
     bars(shares).savefig(folder / "starts.svg")
 
 

@@ -79,7 +79,7 @@ def test_exact_sqp_is_quadratic_and_the_block_diagonal_hessian_linear():
 @pytest.mark.slow
 def test_magic_formula_reference_gives_values_like_the_paper(monkeypatch):
     """What is found of the 16 coefficients, which takes long, is that of the documentation."""
-    results = json.loads((ROOT / "docs" / "paper-results.json").read_text())
+    results = json.loads((ROOT / "docs" / "measured" / "paper.json").read_text())
     kept = {name: results["magic-formula"]["found"][name] for name in COEFFICIENTS}
     monkeypatch.setattr(magic_reference, "_coefficients", lambda speeds, say: kept)
     monkeypatch.setattr(magic_reference, "RAMPS", ((0.6, 3.4),))
