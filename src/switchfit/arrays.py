@@ -26,7 +26,7 @@ Traced: TypeAlias = Any
 have no common type; they have the operators of arrays."""
 
 ArrayModule: TypeAlias = Any
-"""The module that computes with them, `xp`: `numpy`, `jax.numpy`, or the namespace of a graph of scalars."""
+"""The module that computes with them, ``xp``: `numpy`, `jax.numpy`, or the namespace of a graph of scalars."""
 
 Converted: TypeAlias = Any
 """A field of a dataclass that takes what users give, in every form that its docstring lists, and holds one checked form

@@ -3,7 +3,7 @@
 What is a name, and where it is looked up:
 
 - On a page, what stands in single backticks. In a docstring, what stands in single backticks, too; in double ones
-  stands code: expressions, values, shell commands, keys of files.
+  stands code: expressions, values, shell commands, keys of files, unless it begins with a class of the library.
 - A text with a slash or a file's ending is a path: of the repository, of the package, or the end of one.
 - Identifiers joined by dots, with or without a call behind them, are a name. Everything else is code.
 - A name with dots begins with a module of the library, a class, a function, or what can be imported (`jax`, `np`, `sf`). The
@@ -148,6 +148,8 @@ def has_attribute(scope, rest):
 
 def can_be_imported(name):
     first, _, rest = name.partition(".")
+    if hasattr(builtins, first):
+        return hasattr(getattr(builtins, first), rest)
     if first not in IMPORTED and first not in FOREIGN:
         return False
     top = import_module(IMPORTED.get(first, first))
@@ -165,7 +167,7 @@ def can_be_imported(name):
 def has_fields(rest):
     """Whether `rest` is a class of ours with the attribute, as fields of instances are."""
     parts = rest.split(".")
-    return len(parts) > 1 and any(has_attribute(scope, parts[1:]) for scope in find_classes()[parts[0]])
+    return len(parts) > 1 and any(has_attribute(scope, parts[1:]) for scope in find_classes().get(parts[0], ()))
 
 
 def exists(name, local=frozenset()):
@@ -180,7 +182,7 @@ def exists(name, local=frozenset()):
         for whole in find_modules()[".".join(parts[:k])]:
             if not parts[k:] or has_attribute(read_scopes()[whole], parts[k:]):
                 return True
-    return any(has_attribute(scope, parts[1:]) for scope in find_classes()[parts[0]]) or can_be_imported(name)
+    return any(has_attribute(scope, parts[1:]) for scope in find_classes().get(parts[0], ())) or can_be_imported(name)
 
 
 def is_path(text):
@@ -242,7 +244,8 @@ def test_names_in_docstrings_exist():
     missing = []
     for path in sorted(PACKAGE.rglob("*.py")):
         for line, text, local in docstrings_of(ast.parse(path.read_text())):
-            text = re.sub(r"``.*?``", "", text, flags=re.DOTALL)
-            names = re.findall(r"`([^`]+)`", text)
+            code = re.findall(r"``(.*?)``", text, re.DOTALL)
+            names = [each for each in code if each.partition(".")[0] in find_classes()]
+            names += re.findall(r"`([^`]+)`", re.sub(r"``.*?``", "", text, flags=re.DOTALL))
             missing += [f"{path.relative_to(PACKAGE)}:{line}: {name}" for name in names if not is_there(name, local)]
     assert not missing, "\n".join(missing)

@@ -39,7 +39,7 @@ def list_places(problem: Problem) -> NDArray[np.intp]:
     """Return the places in theta of the transition times whose profiles are looked at: (T,).
 
     None where J has no noise model, with guards, terminal constraints or corners of the state, of which compiled
-    programs know nothing, and of more than `MOST_RUNS` experiments.
+    programs know nothing, and of more than `MOST_TRACED_RUNS` experiments.
     """
     alone = problem.is_sigma_known is None or problem.constraint_names or any(map(has_corners, problem.structures))
     if alone or len(problem.experiments) > transition_profiles.MOST_TRACED_RUNS:

@@ -7,7 +7,7 @@ place of t, and the last step ends at the end time exactly. This is the step siz
 Norsett and Wanner I, section II.4). Steps of the implicit method have the error of `row_errors.estimate_error`, whose
 order is 4: the exponent is -1/4. A step whose stages are not found has an error that is NaN, and is rejected.
 
-Functions of one step take `xp`, the module for their arrays: NumPy, or the namespace of a graph of scalars.
+Functions of one step take ``xp``, the module for their arrays: NumPy, or the namespace of a graph of scalars.
 """
 
 from __future__ import annotations

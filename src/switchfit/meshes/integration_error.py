@@ -36,7 +36,7 @@ from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
 
 LARGEST_INTEGRATION_ERROR = 1e-8
-"""Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.fit.accuracy`) above
+"""Relative error of J, a guard or a terminal constraint (by halving all steps) above
 which the mesh is refined again, unless rtol allows more."""
 
 LARGE_INTEGRATION_ERROR = 1e-6

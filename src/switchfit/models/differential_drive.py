@@ -50,7 +50,7 @@ def differential_drive(
     (ideal differential drive). In ``"slip"`` they are parameters: skidding vehicles turn as if they were wider than
     they are.
 
-    Centers that stay where they are make `v_x` linear in the wheel speeds. On soft or rough ground, wheels that are
+    Centers that stay where they are make ``v_x`` linear in the wheel speeds. On soft or rough ground, wheels that are
     dragged sideways also lose speed forward: with `turn_slip`, "slip" has the empirical factor
 
         v_x (1 - turn_slip abs(V_r - V_l) / (abs(V_l) + abs(V_r))),

@@ -1,6 +1,6 @@
 """Formulas that the SQP shares with its traced version: constraints at a point, scales, and when a step is accepted.
 
-Each is written once, for NumPy and for JAX: `xp` is the module whose arrays it is given, and constraints are anything
+Each is written once, for NumPy and for JAX: ``xp`` is the module whose arrays it is given, and constraints are anything
 with ``A`` (m, d), ``b`` (m,), ``lower`` and ``upper`` (d,). What needs sets of changing size, or stops early, cannot be
 traced; there the two programs differ, and `traced_qp`, `traced_sqp` say at each place why.
 

@@ -1,7 +1,7 @@
 """One thread for the optimizer's own linear algebra; the caller's functions run with the caller's number of threads.
 
-OpenBLAS wakes its threads for systems that one thread solves in a microsecond (`dtrtrs` with several right-hand sides
-at any size, `eigh` from 30 unknowns on), and waits for all of them: for a millisecond where another process has their
+OpenBLAS wakes its threads for systems that one thread solves in a microsecond (``dtrtrs`` with several right-hand sides
+at any size, ``eigh`` from 30 unknowns on), and waits for all of them: for a millisecond where another process has their
 core. The number of threads is a setting of the whole process, so that it is 1 while any thread is in the optimizer, and
 restored when the last one leaves. threadpoolctl is not used: each of its limits restores what it found itself, so that
 after two that overlap in two threads one thread remains, and it takes five times as long.

@@ -8,7 +8,7 @@ With ``u = (r / sigma)**2`` and C the scale of the loss, a sample costs ``1/2 C*
     huber     rho(z) = z for z <= 1, else 2 sqrt(z) - 1     (its second derivative jumps at z = 1)
     cauchy    rho(z) = log(1 + z)
 
-Every function takes arrays of NumPy or JAX; `xp` is their module.
+Every function takes arrays of NumPy or JAX; ``xp`` is their module.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ class Issue(Printed):
     Attributes
     ----------
     kind : str
-        Kind of the issue, such as "collapsed" or "integration error"; `switchfit.report.sentences` lists the kinds.
+        Kind of the issue, such as "collapsed" or "integration error"; `report.issues` lists the kinds.
     subjects : tuple of str
         Names of the unknowns, channels or outputs that it concerns.
     figures : mapping of str to float or tuple of float

@@ -22,7 +22,7 @@ LIKELY_IN_DEVIATIONS = 5.0
 
 
 def choose_grid(run: Experiment) -> float:
-    """Return the time between births: that between samples, but at most `INTERVALS` in the horizon."""
+    """Return the time between births: that between samples, but at most `MOST_GRID_INTERVALS` in the horizon."""
     shortest = (run.end - run.t0) / MOST_GRID_INTERVALS
     gaps = [np.diff(item.times) for item in run.measurements]
     usual = [float(np.median(gap)) for gap in gaps if len(gap)]

@@ -27,7 +27,7 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
     Parameters
     ----------
     problem : Problem
-        Unknowns without bounds are drawn around their guesses (`FACTOR`).
+        Unknowns without bounds are drawn around their guesses (`RANGE_FACTOR`).
     count, seed : int
     """
     from scipy.stats import qmc  # here, since importing it takes longer than most fits

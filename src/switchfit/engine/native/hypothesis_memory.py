@@ -20,9 +20,9 @@ WINDOW = 4
 the birth is, and how long the next mode lasts at least."""
 
 HYPOTHESIS_POINTERS = "nodes", "signals", "c", "units", "tolerances", "low", "high", "most", "jump_first", "jump_map"
-"""Pointers in the table, before those of the scratch space and of the samples. `jump_first` (G + 2,) has the place in
-`jump_map` of the first jump at each node; `low` and `high` (D,) are the bounds of `moved`, and `most` (D,) is how far
-it may move at once."""
+"""Pointers in the table, before those of the scratch space and of the samples. ``jump_first`` (G + 2,) has the place
+in ``jump_map`` of the first jump at each node; ``low`` and ``high`` (D,) are the bounds of ``moved``, and ``most`` (D,)
+is how far it may move at once."""
 
 HYPOTHESIS_SAMPLE_POINTERS = ("first", "time", "value", "weight")
 """For each Measurements: the place of the first sample at each node (G + 2,), then as `layout.SAMPLE_ARGUMENTS`."""

@@ -52,7 +52,7 @@ def describe_keys(kind: type[TomlTable]) -> dict[str, str]:
     """Return the text below each key of a table, in one line.
 
     It is read from the source when it is needed. pydantic would read it for all tables when they are defined
-    (`use_attribute_docstrings`), which takes a tenth of the time until an unknown key is named.
+    (``use_attribute_docstrings``), which takes a tenth of the time until an unknown key is named.
 
     Parameters
     ----------

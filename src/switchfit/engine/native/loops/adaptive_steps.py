@@ -41,7 +41,7 @@ def write_slope(kernels: Kernels, mode: int, stage: Template) -> None:
 def _evaluate(
     kernels: Kernels, graph: Graph, stage: Template, number: str = "", checked: bool = True
 ) -> Callable[[Objects, Sequence[int]], list[Objects]]:
-    """Return some outputs of a mode as a function of the state, at the time of a `moment` with this number."""
+    """Return some outputs of a mode as a function of the state, at the time of a ``moment`` with this number."""
     t, origin = graph.loads(f"moment{number}", 2)
     at = kernels.take_inputs(graph, origin, f"signal{number}")
     return lambda x, only: stage(graph, *at(t, x), only=only, checked=checked)

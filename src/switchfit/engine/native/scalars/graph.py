@@ -263,7 +263,7 @@ class Graph:
 
 
 class Namespace:
-    """NumPy functions, by name, for arrays of nodes: the `xp` of functions that run with NumPy too.
+    """NumPy functions, by name, for arrays of nodes: the ``xp`` of functions that run with NumPy too.
 
     Comparisons of nodes yield truth values, except ``==``, which tests whether two nodes are the same object.
     """

@@ -26,7 +26,7 @@ class Operation(NamedTuple):
     ----------
     name : str
     value : callable
-        Function of NumPy that evaluates it for numbers or arrays; `scalars.Namespace` finds the operation by it.
+        Function of NumPy that evaluates it for numbers or arrays; `Namespace` finds the operation by it.
     code : str
         LLVM's instruction, with {0}, {1}, {2} for the operands and {type} for the type of the result: a double, a
         vector of doubles or a truth value.
@@ -34,7 +34,7 @@ class Operation(NamedTuple):
         Number of operands.
     gives_truth : bool
         Whether the result is a truth value, else it is a double; operands are truth values where there are primitives
-        `of_truth`. `select` is treated separately.
+        `of_truth`. ``select`` is treated separately.
     function : str or None
         Function that its code calls: an intrinsic ("llvm.") or a function of the C library.
     primitives, of_truth : tuple of str

@@ -182,7 +182,7 @@ def _fill_value(given: ArrayLike | None, dtype: np.dtype[Any]) -> float:
 def scatter(
     graph: Graph, equation: Equation, a: TracedArray, indices: TracedArray, updates: TracedArray, combine: Combine
 ) -> Objects:
-    """Trace `jax.lax.scatter`, `scatter_add` and their variants."""
+    """Trace `jax.lax.scatter`, `jax.lax.scatter_add` and their variants."""
     params = equation.params
     numbers = params["dimension_numbers"]
     inside, dropped = numbers.update_window_dims, (*numbers.inserted_window_dims, *numbers.operand_batching_dims)

@@ -17,7 +17,7 @@ from switchfit.engine.native.tracing.integers import Meaning
 from switchfit.engine.native.tracing.unsupported import Unsupported
 
 OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": "jnp.linalg.eig", "fft": "jnp.fft"}
-"""Public names of operations for which it is not `jax.lax.NAME`."""
+"""Public names of operations for which it is not ``jax.lax.NAME``."""
 
 
 def get_meaning(graph: Graph, name: str, params: Parameters, dtype: np.dtype[Any]) -> Callable[..., Any]:
