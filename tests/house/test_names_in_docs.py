@@ -38,11 +38,11 @@ FOREIGN = {"daqp", "jax", "llvmlite", "matplotlib", "numpy", "pydantic", "pymap3
 FOREIGN |= sys.stdlib_module_names
 """Libraries whose names may stand in backticks."""
 
-NO_NAMES: set[str] = set()
-"""Words in backticks that are code although they look like names."""
+NO_NAMES = {"slow"}
+"""Words in backticks that look like names and are none: a marker of tests."""
 
 PATH = re.compile(r"[\w./<>*-]+")
-ENDINGS = (".py", ".md", ".rst", ".toml", ".js", ".html", ".json", ".csv", ".yml", ".yaml")
+ENDINGS = (".py", ".pyi", ".md", ".rst", ".toml", ".js", ".html", ".json", ".csv", ".yml", ".yaml")
 NAME = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*)(?:\(.*\))?", re.DOTALL)
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
@@ -139,7 +139,7 @@ def public_arguments():
 def has_attribute(scope, rest):
     """Whether a scope, or one of its bases, has the attributes, one after the other."""
     first, *more = rest
-    bases = [base for name in scope.bases for base in find_classes()[name]]
+    bases = [base for name in scope.bases for base in find_classes().get(name, ())]
     if not (first in scope.names or any(has_attribute(base, [first]) for base in bases)):
         return False
     inner = scope.scopes.get(first)

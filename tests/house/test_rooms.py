@@ -1,6 +1,7 @@
 """The rooms of the library: each imports only those before it, and modules of its own without a circle."""
 
 import ast
+import re
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -106,3 +107,9 @@ def test_only_what_is_public_is_shown_and_no_verb_is_a_module():
     verbs = {name for name in sf.__all__ if name.islower()}
     assert len(verbs) > 10
     assert not verbs & {part for name in MODULES for part in name.split(".")}
+
+
+def test_the_page_of_internals_has_the_rooms_in_this_order():
+    page = (Path(__file__).parents[2] / "docs" / "internals.md").read_text()
+    rooms = re.findall(r"^\| `(\w+)` \|", page[: page.index("## Data flow")], re.MULTILINE)
+    assert rooms == [room for room in LAYERS if room != "__main__"]
