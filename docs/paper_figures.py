@@ -1,4 +1,4 @@
-"""The figures of the page on the paper, from docs/measured/paper.json; the documentation draws them when it is built."""
+"""The figures of the page on the paper, from docs/measured/paper.json; the documentation draws them when built."""
 
 from __future__ import annotations
 

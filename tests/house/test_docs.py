@@ -172,7 +172,7 @@ def test_every_public_name_is_in_the_reference():
 
 
 def test_the_documentation_is_short():
-    """Pages without the tables of docs/measured, which benchmarks write; the path of a newcomer; two screens of README."""
+    """Pages without the tables that benchmarks write (docs/measured); the path of a newcomer; two screens of README."""
     pages = [ROOT / "README.md", *ROOT.glob("docs/*.md")]
     readme = (ROOT / "README.md").read_text().splitlines()
     assert sum(len(page.read_text().split()) for page in pages) <= 35_000

@@ -2,14 +2,14 @@
 
 What is a name, and where it is looked up:
 
-- On a page, what stands in single backticks. In a docstring, what stands in single backticks, too; in double ones
-  stands code: expressions, values, shell commands, keys of files, unless it begins with a class of the library.
+- On a page and in a docstring, what stands in single backticks. In double ones of a docstring stands code
+  (expressions, values, shell commands, keys of files), unless it begins with a class of the library.
 - A text with a slash or a file's ending is a path: of the repository, of the package, or the end of one.
 - Identifiers joined by dots, with or without a call behind them, are a name. Everything else is code.
-- A name with dots begins with a module of the library, a class, a function, or what can be imported (`jax`, `np`, `sf`). The
-  rest are attributes, one after the other: those of a class also of its bases, fields of instances, and what methods set.
+- A name with dots begins with a module of the library, a class, a function, or what can be imported (`jax`, `sf`). The
+  rest are attributes, one after the other: those of a class also of its bases, and what methods set.
 - A name without dots is a module, a definition of a module, an attribute of a class, or a builtin; in a docstring also
-  an argument or a variable of the same function, or of the function around it; on a page an argument of a public function.
+  an argument or a variable of the function that it stands in or of one around it; on a page a public argument.
 """
 
 import ast

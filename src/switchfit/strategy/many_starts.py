@@ -54,8 +54,8 @@ def try_starts(
     """Return the lowest end of short fits from random starts, theta (d,) among them.
 
     They stop where, after n fits that ended in w different minima, no more than half a minimum is expected to be
-    missing ([1]_), and the lowest has been found `AGREEING_ENDS` times. Ctrl-C and the end of the time budget end them as
-    well, once one has ended.
+    missing ([1]_), and the lowest has been found `AGREEING_ENDS` times. Ctrl-C and the end of the time budget end them
+    as well, once one has ended.
 
     Parameters
     ----------
