@@ -52,13 +52,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from switchfit.arrays import Traced
 from switchfit.discretization.arguments import Arguments, Samples
 from switchfit.discretization.mesh import find_row_ending_cell
 from switchfit.discretization.model import Field, Model
@@ -69,6 +70,10 @@ from switchfit.discretization.runge_kutta import Tableau
 from switchfit.discretization.sampled_states import find_late_rows, step_to_late_sample
 from switchfit.discretization.signals import Piece
 from switchfit.problem.structure import Structure
+
+Given = TypeVar("Given")
+State = TypeVar("State")
+"""An array, or a tuple of arrays."""
 
 Array = jax.Array
 Function = Callable[[Array, Array, Array], Array]
@@ -289,7 +294,7 @@ def integrate_sensitivities(
         D1f, Dpf = given
         return Sensitivities(D1f @ now.Phi_X, D1f @ now.Dp_x + Dpf)  # (10) as a differential equation
 
-    def row(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
+    def row(now: Sensitivities, given: tuple[Traced, ...]) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
         segment, opens, start, end, piece, states = given
         # The columns X^i begin at tau_i. Misprint in the display before (10): segment k integrates from tau_k, not t0.
         jumped = Sensitivities(D1R[segment] @ now.Phi_X + X_columns[segment], D1R[segment] @ now.Dp_x + DpR[segment])
@@ -355,7 +360,9 @@ def sweep_backward(
 
         return back
 
-    def row(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], Adjoints]:
+    def row(
+        now: tuple[Adjoints, Quadratures], given: tuple[Traced, ...]
+    ) -> tuple[tuple[Adjoints, Quadratures], Adjoints]:
         segment, opens, jump, late, start, end, *trajectory = given
         adjoints, total = now
         d = differentiate_along_row(model, segment, p, start, end, *trajectory)
@@ -454,7 +461,7 @@ def add_sample_jumps(
     starts, total = pick(ends, slice(1, None)), Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
     for k, (sensor, samples) in enumerate(zip(model.structure.measurements, model.arguments.samples, strict=True)):
 
-        def add_late(Dp_x: Array, x: Array, sample: Samples, *row: Any, k: int = k) -> tuple[Adjoints, Quadratures]:
+        def add_late(Dp_x: Array, x: Array, sample: Samples, *row: Traced, k: int = k) -> tuple[Adjoints, Quadratures]:
             segment, piece, start = row
 
             def cost(x: Array, p: Array) -> Array:
@@ -514,7 +521,9 @@ def add_initial_state(model: Model, adjoints: Adjoints, p: Array) -> Quadratures
 # Tools
 
 
-def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, given: Any, y: Any) -> tuple[Any, Any]:
+def step_linear(
+    tableau: Tableau, rate: Callable[[Given, State], State], h: Array, given: Given, y: State
+) -> tuple[State, State]:
     """Return one Runge-Kutta step of ``dy/dt = rate(given, y)``, affine in y: its stage states (s, ...) and y at its
     end.
 
@@ -523,7 +532,7 @@ def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, giv
     flat, unravel = ravel_pytree(y)
     a, b, c = tableau.a, tableau.b, tableau.c
 
-    def slope(given: Any, y: Array) -> Array:
+    def slope(given: Given, y: Array) -> Array:
         return ravel_pytree(rate(given, unravel(y)))[0]
 
     if tableau.coupled:
@@ -554,7 +563,7 @@ def differentiate(function: Function, t: Array, x: Array, p: Array) -> Slopes:
 def differentiate_twice(function: Function, t: Array, x: Array, p: Array) -> Bends:
     """Return the first and second derivatives in x and p of a function of (t, x, p)."""
 
-    def first(t: Array, x: Array, p: Array) -> tuple[Any, Any]:
+    def first(t: Array, x: Array, p: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         derivatives = jax.jacfwd(function, argnums=(1, 2))(t, x, p)
         return derivatives, derivatives
 
@@ -568,22 +577,22 @@ def contract(psi: Array, second: Array) -> Array:
     return jnp.tensordot(psi, second, 1)
 
 
-def add(one: Any, other: Any) -> Any:
+def add(one: State, other: State) -> State:
     """Return the sum of two tuples of arrays."""
     return jax.tree.map(jnp.add, one, other)
 
 
-def where(condition: Array, one: Any, other: Any) -> Any:
+def where(condition: Array, one: State, other: State) -> State:
     """Return `one` or `other`, tuples of arrays."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
 
 
-def pick(values: Any, index: Any) -> Any:
+def pick(values: State, index: Array | int | slice) -> State:
     """Return ``values[index]`` of a tuple of arrays."""
     return jax.tree.map(lambda a: a[index], values)
 
 
-def scatter(values: Any, index: Array, added: Any) -> Any:
+def scatter(values: State, index: Array, added: State) -> State:
     """Return a tuple of arrays with others (K, ...) added at places (K,) of their first axis."""
     return jax.tree.map(lambda a, b: a.at[index].add(b), values, added)
 

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
+from switchfit.arrays import Traced
 from switchfit.problem.corners.branches import find_corners
 from switchfit.problem.functions import Function
-from switchfit.problem.jaxprs import Walk, find_line, find_public_name
+from switchfit.problem.jaxprs import Walk, find_line, find_public_name, strip_constants
 from switchfit.problem.problem import Problem, keep_with_problem
+from switchfit.runtime.jax_internals import ClosedJaxpr, Equation, Jaxpr, array_type
 
 VERBS = {
     **dict.fromkeys(("lt", "le", "gt", "ge", "eq", "ne", "lt_to", "le_to"), "compares with"),
@@ -110,17 +111,17 @@ def list_comparisons(function: Function, with_state: bool = True, bends: bool = 
     return tuple(dict.fromkeys(walk.found))
 
 
-class _Comparing(Walk):
+class _Comparing(Walk[Names]):
     """Finds the comparisons of a function; what it follows are the parameters on which values depend."""
 
     def __init__(self, bends: bool) -> None:
         self._bends = bends
         self.found: list[tuple[str, str]] = []
 
-    def constant(self, value: Any) -> Names:
+    def constant(self, value: Traced) -> Names:
         return NO_PARAMETERS
 
-    def apply(self, equation: Any, given: list[Names], origin: Any) -> list[Names]:
+    def apply(self, equation: Equation, given: list[Names], origin: Equation) -> list[Names]:
         names = NO_PARAMETERS.union(*given)
         is_bend = self._bends and equation.primitive.name in BENDS
         if (is_bend or _jumps(equation)) and STATE not in names:
@@ -134,16 +135,16 @@ class _Comparing(Walk):
         return results
 
 
-def _jumps(equation: Any) -> bool:
+def _jumps(equation: Equation) -> bool:
     """Return whether an operation jumps: a comparison other than that of a number with itself, or rounding."""
     name = equation.primitive.name
     if name == "convert_element_type":
-        kinds = equation.invars[0].aval.dtype.kind, np.dtype(equation.params["new_dtype"]).kind
+        kinds = array_type(equation.invars[0]).dtype.kind, np.dtype(equation.params["new_dtype"]).kind
         return kinds[0] == "f" and kinds[1] in "iub"
     return name in VERBS and (len(equation.invars) < 2 or equation.invars[0] is not equation.invars[1])
 
 
-def _list_calls(equation: Any, given: list[Names]) -> Iterator[tuple[Any, list[Names]]]:
+def _list_calls(equation: Equation, given: list[Names]) -> Iterator[tuple[Jaxpr | ClosedJaxpr, list[Names]]]:
     """Yield the jaxprs that an operation runs, with the parameters on which their arguments depend."""
     params = equation.params
     if equation.primitive.name == "while":
@@ -154,6 +155,6 @@ def _list_calls(equation: Any, given: list[Names]) -> Iterator[tuple[Any, list[N
         for branch in params["branches"]:
             yield branch, given[1:]
     elif "jaxpr" in params:  # calls and loops; custom derivatives have rules of their own
-        inner = getattr(params["jaxpr"], "jaxpr", params["jaxpr"])
+        inner = strip_constants(params["jaxpr"])
         if len(inner.invars) == len(given):
             yield params["jaxpr"], given

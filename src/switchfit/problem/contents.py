@@ -59,7 +59,7 @@ class NotPlain(Exception):  # noqa: N818  # control flow: the caller traces
     """A function reads something that cannot be compared by content."""
 
 
-def read_contents(function: Any) -> Hashable | None:
+def read_contents(function: object) -> Hashable | None:
     """Return everything that a function reads, by content; None if it is unknown and the function has to be traced."""
     try:
         return _read(function)

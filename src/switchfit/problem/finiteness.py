@@ -10,15 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, Traced
 from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.jaxprs import Walk, evaluate, find_line, find_public_name
+from switchfit.runtime.jax_internals import Equation
+
+Followed = tuple[Traced, bool]
+"""A value at a point, and whether it moves with what derivatives are taken in."""
 
 GROWING = frozenset(
     {"add", "sub", "mul", "neg", "exp", "exp2", "expm1", "sinh", "cosh", "square", "dot_general", "reduce_sum"}
@@ -55,7 +59,11 @@ class Undefined(NamedTuple):
 
 
 def find_undefined(
-    function: Function, arguments: Sequence[FloatArray], parameters: Mapping[str, Any], *, derivatives: bool = True
+    function: Function,
+    arguments: Sequence[FloatArray],
+    parameters: Mapping[str, Traced],
+    *,
+    derivatives: bool = True,
 ) -> Undefined | None:
     """Return the first operation of a function that is not finite, at the first of some points; None if there is none.
 
@@ -90,17 +98,17 @@ def find_undefined(
 
 
 @lru_cache(maxsize=64)
-def _compile(function: Function, moving: tuple[int, ...], varying: int) -> Callable[..., Any]:
+def _compile(function: Function, moving: tuple[int, ...], varying: int) -> Callable[..., jax.Array]:
     """Return a compiled check whether the value of a function is finite, and its derivatives in some of its arguments,
     at each point: (N, 2).
     """
 
-    def call(*every: Any) -> Any:
+    def call(*every: Traced) -> Traced:
         return function.evaluate(every)
 
     slope = jax.jacrev(call, moving)
 
-    def check(given: list[Any], named: list[Any]) -> Any:
+    def check(given: list[Traced], named: list[Traced]) -> Traced:
         every = [*given, *named]
         derivatives = [slope(*every), jax.jacfwd(slope, moving)(*every)] if moving else []
         return jnp.stack([_are_finite([call(*every)]), _are_finite(jax.tree.leaves(derivatives))])
@@ -108,7 +116,7 @@ def _compile(function: Function, moving: tuple[int, ...], varying: int) -> Calla
     return jax.jit(jax.vmap(check, in_axes=(0, None)) if varying else check)
 
 
-class _Checking(Walk):
+class _Checking(Walk[Followed]):
     """Evaluates a function at a point, and checks its operations; what it follows are values, and whether they move.
 
     Attributes
@@ -120,10 +128,10 @@ class _Checking(Walk):
     def __init__(self) -> None:
         self.found: tuple[str, str, int] | None = None
 
-    def constant(self, value: Any) -> tuple[Any, bool]:
+    def constant(self, value: Traced) -> Followed:
         return value, False
 
-    def apply(self, equation: Any, given: list[tuple[Any, bool]], origin: Any) -> list[tuple[Any, bool]]:
+    def apply(self, equation: Equation, given: list[Followed], origin: Equation) -> list[Followed]:
         name = equation.primitive.name
         operands, which = [value for value, _ in given], [moves for _, moves in given]
         if name in ("jit", "pjit"):
@@ -136,34 +144,35 @@ class _Checking(Walk):
         if self.found is None and not is_growing and _are_finite(operands):
             order = _find_order(equation, operands, which, results)
             if order is not None:
-                caller = None if origin is equation else find_public_name(origin.params.get("jaxpr"))
+                called = None if origin is equation else origin.params.get("jaxpr")
+                caller = None if called is None else find_public_name(called)
                 self.found = caller or name, find_line(origin), order
         return [(result, any(which)) for result in results]
 
 
-def _find_order(equation: Any, operands: list[Any], which: list[bool], results: list[Any]) -> int | None:
+def _find_order(equation: Equation, operands: list[Traced], which: list[bool], results: list[Traced]) -> int | None:
     """Return the order of the first derivative of an operation in some operands that is not finite, 0 for its value."""
     floats = [k for k, moves in enumerate(which) if moves and _is_float(operands[k])]
 
-    def call(*moved: Any) -> list[Any]:
+    def call(*moved: Traced) -> list[Traced]:
         made = evaluate(equation, [moved[floats.index(k)] if k in floats else a for k, a in enumerate(operands)])
         return list(filter(_is_float, made))
 
     at = tuple(operands[k] for k in floats)
     ones = tuple(map(jnp.ones_like, at))
 
-    def slope(*moved: Any) -> list[Any]:
+    def slope(*moved: Traced) -> list[Traced]:
         return jax.jvp(call, moved, ones)[1]
 
     orders = (lambda: results, lambda: slope(*at), lambda: jax.jvp(slope, at, ones)[1])
     return next((order for order, find in enumerate(orders if floats else orders[:1]) if not _are_finite(find())), None)
 
 
-def _are_finite(values: Sequence[Any]) -> Any:
+def _are_finite(values: Sequence[Traced]) -> Traced:
     """Return whether all floating-point numbers of some arrays are finite."""
     checked = [jnp.isfinite(value).all() for value in values if _is_float(value)]
     return jnp.stack(checked).all() if checked else jnp.array(True)
 
 
-def _is_float(value: Any) -> bool:
+def _is_float(value: Traced) -> bool:
     return bool(jnp.issubdtype(jnp.result_type(value), jnp.floating))

@@ -10,23 +10,31 @@ from __future__ import annotations
 import hashlib
 import itertools
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from itertools import compress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.arrays import Traced
 from switchfit.problem.contents import JITTED, read_contents
 from switchfit.problem.jaxpr_text import describe_jaxpr
 from switchfit.problem.jaxprs import find_read_entries, list_jaxprs
 from switchfit.problem.traced_constants import refuse_wrong_constants
 from switchfit.problem.validation.messages import join_names
 from switchfit.problem.validation.objects import find_misfit
-from switchfit.runtime.jax_internals import copy_constants, copy_literals, drop_unused, evaluate_jaxpr, forget_names
+from switchfit.runtime.jax_internals import (
+    ClosedJaxpr,
+    copy_constants,
+    copy_literals,
+    drop_unused,
+    evaluate_jaxpr,
+    forget_names,
+)
 
 Array = jax.Array
 Shape = tuple[int, ...]
@@ -34,7 +42,7 @@ Shape = tuple[int, ...]
 UNTRACEABLE = (jax.errors.ConcretizationTypeError, jax.errors.TracerIntegerConversionError)
 """Exceptions of JAX when Python code needs the value of a traced number."""
 
-_traces: dict[Any, Function] = {}
+_traces: dict[Hashable, Function] = {}
 _lock = threading.Lock()
 
 MOST_TRACES = 1024
@@ -46,7 +54,7 @@ _retracing = jax.make_user_context(0)
 """With a new value, JAX does not reuse earlier traces of jitted functions inside a function."""
 
 
-def use_float64() -> Any:
+def use_float64() -> AbstractContextManager[object]:
     """Return a context in which JAX computes in float64; the user's setting is restored at its end."""
     return jax.enable_x64(True)
 
@@ -71,7 +79,7 @@ class Function:
         Hash of the jaxpr's content, the same in every process.
     """
 
-    def __init__(self, closed: Any, parameters: tuple[str, ...]) -> None:
+    def __init__(self, closed: ClosedJaxpr, parameters: tuple[str, ...]) -> None:
         self.parameters = parameters
         self.shape: Shape = tuple(closed.out_avals[0].shape)
         self.jaxpr, self.consts = closed.jaxpr, closed.consts
@@ -81,13 +89,13 @@ class Function:
         self._opaque = tuple(content.opaque)  # compared by identity, therefore kept alive
         self._key = (self.digest, tuple(map(id, self._opaque)))
 
-    def __call__(self, *arguments: Any) -> Array:
+    def __call__(self, *arguments: Traced) -> Array:
         """Evaluate for arguments in the order of the user's function, p being a mapping of names to arrays."""
         flat = [_as_float64(a) for a in arguments if not isinstance(a, Mapping)]
         named = next(argument for argument in arguments if isinstance(argument, Mapping))
         return self.evaluate([*flat, *(named[name] for name in self.parameters)])
 
-    def evaluate(self, given: Sequence[Any]) -> Array:
+    def evaluate(self, given: Sequence[Traced]) -> Array:
         """Evaluate for the arguments of the jaxpr: the parameters are the last."""
         return evaluate_jaxpr(self.jaxpr, self.consts, *given)[0]
 
@@ -102,7 +110,7 @@ class Function:
         """Whether it takes an input after t, the state and the parameters."""
         return len(self.structs) - len(self.parameters) > 2
 
-    def derive(self, evaluate: Callable[..., Any]) -> Function:
+    def derive(self, evaluate: Callable[..., Traced]) -> Function:
         """Return another function of the same arguments, with its rate beside the input; `evaluate` takes those of the
         jaxpr.
         """
@@ -121,7 +129,7 @@ class Function:
         return self is other or (isinstance(other, Function) and self._key == other._key)
 
 
-def _as_float64(value: Any) -> Any:
+def _as_float64(value: Traced) -> Traced:
     """Return a value as a float64 array without weak type, which Python's numbers have, as the jaxpr requires."""
     is_double = getattr(value, "dtype", None) == np.float64 and not getattr(value, "weak_type", False)
     return value if is_double else jnp.asarray(value, jnp.float64)
@@ -143,7 +151,7 @@ class Call(NamedTuple):
         Names of the entries of the last argument, which is then passed as a dict; the `Function` takes an array.
     """
 
-    function: Callable[..., Any]
+    function: Callable[..., Traced]
     arguments: tuple[Shape | None, ...]
     shape: Shape | None
     what: str
@@ -189,7 +197,7 @@ def _trace(call: Call, parameters: Mapping[str, Shape]) -> Function:
     position, count = call.arguments.index(None), len(call.arguments) - 1
 
     def evaluate(*given: Array) -> Array:
-        flat: list[Any] = list(given[:count])
+        flat: list[Traced] = list(given[:count])
         if call.inputs:
             flat[-1] = {name: flat[-1][k] for k, name in enumerate(call.inputs)}
         named = dict(zip(parameters, given[count:], strict=True))
@@ -209,7 +217,7 @@ def _trace(call: Call, parameters: Mapping[str, Shape]) -> Function:
 # Calling a user's function while tracing
 
 
-def _call_while_tracing(call: Call, arguments: tuple[Any, ...]) -> Array:
+def _call_while_tracing(call: Call, arguments: tuple[Traced, ...]) -> Array:
     """Call a user's function while tracing; turn any exception into one sentence that names the function."""
     function, what, form = call.function, call.what, call.form
     misfit = find_misfit(function, arguments)
@@ -244,7 +252,7 @@ def _call_while_tracing(call: Call, arguments: tuple[Any, ...]) -> Array:
         raise ValueError(f"{what}: {form} must return an array of numbers; got {value!r}.") from error
 
 
-def call_for_vector(call: Call, arguments: tuple[Any, ...]) -> Array:
+def call_for_vector(call: Call, arguments: tuple[Traced, ...]) -> Array:
     """Return the result of a user's function, checked (while tracing) to be a float64 array of the required shape."""
     array, shape, what, form = _call_while_tracing(call, arguments), call.shape, call.what, call.form
     if shape is not None and array.shape != shape:

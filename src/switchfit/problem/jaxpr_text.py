@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
 
-from switchfit.runtime.jax_internals import evaluate_jaxpr
-
-# The content of a jaxpr
+from switchfit.arrays import Traced
+from switchfit.problem.jaxprs import strip_constants
+from switchfit.runtime.jax_internals import Atom, ClosedJaxpr, Jaxpr, evaluate_jaxpr
 
 UNCOMPARED_PARAMETERS = (
     "jvp_jaxpr_fun",
@@ -28,7 +27,7 @@ UNCOMPARED_PARAMETERS = (
 """Parameters of operations that are not compared: names, and derivative rules, which show in the derivatives."""
 
 
-def describe_jaxpr(closed: Any) -> _Text:
+def describe_jaxpr(closed: ClosedJaxpr) -> _Text:
     """Return a jaxpr as text, with the values of its constants, and the objects in it that have no text."""
     text = _Text(closed)
     if text.has_rules:
@@ -39,13 +38,13 @@ def describe_jaxpr(closed: Any) -> _Text:
     return text
 
 
-def _differentiate_twice(closed: Any) -> Any:
+def _differentiate_twice(closed: ClosedJaxpr) -> ClosedJaxpr:
     """Return the jaxpr of the first and second derivatives along all arguments, in which custom rules are applied."""
 
-    def value(*arguments: Any) -> Any:
+    def value(*arguments: Traced) -> Traced:
         return evaluate_jaxpr(closed.jaxpr, closed.consts, *arguments)[0]
 
-    def slope(*arguments: Any) -> Any:
+    def slope(*arguments: Traced) -> Traced:
         return jax.jvp(value, arguments, arguments)[1]
 
     return jax.make_jaxpr(lambda *a: (slope(*a), jax.jvp(slope, a, a)[1]))(*closed.in_avals)
@@ -54,17 +53,17 @@ def _differentiate_twice(closed: Any) -> Any:
 class _Text:
     """Lines that describe a jaxpr, variables numbered in their order."""
 
-    def __init__(self, closed: Any) -> None:
+    def __init__(self, closed: ClosedJaxpr) -> None:
         self.lines: list[str] = []
-        self.opaque: list[Any] = []
+        self.opaque: list[object] = []
         self.has_rules = False
         self.add(closed.jaxpr, closed.consts)
 
-    def add(self, jaxpr: Any, consts: Sequence[Any]) -> None:
+    def add(self, jaxpr: Jaxpr, consts: Sequence[Traced]) -> None:
         """Describe a jaxpr."""
-        number: dict[Any, int] = {}
+        number: dict[Atom, int] = {}
 
-        def atom(a: Any) -> str:
+        def atom(a: Atom) -> str:
             return self._array(a.val) if hasattr(a, "val") else f"%{number.setdefault(a, len(number))}"
 
         for variables in (jaxpr.constvars, jaxpr.invars):
@@ -80,10 +79,10 @@ class _Text:
                     self._parameter(name, value)
         self.lines.append("-> " + " ".join(map(atom, jaxpr.outvars)))
 
-    def _parameter(self, name: str, value: Any) -> None:
+    def _parameter(self, name: str, value: Traced) -> None:
         if hasattr(value, "eqns"):
             self.lines.append(f"{name}:")
-            self.add(getattr(value, "jaxpr", value), getattr(value, "consts", ()))
+            self.add(strip_constants(value), getattr(value, "consts", ()))
         elif isinstance(value, (tuple, list)) and any(hasattr(v, "eqns") for v in value):
             for entry in value:
                 self._parameter(name, entry)
@@ -96,7 +95,7 @@ class _Text:
                 self.opaque.append(value)
             self.lines.append(f"{name}={text}")
 
-    def _array(self, value: Any) -> str:
+    def _array(self, value: Traced) -> str:
         array = np.asarray(value)
         digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).hexdigest()
         return f"{array.dtype}{list(array.shape)}{digest}"

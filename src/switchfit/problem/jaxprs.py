@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
 from itertools import chain
-from typing import Any
+from typing import Generic, TypeVar, cast
 
 import jax
 import numpy as np
 
-from switchfit.runtime.jax_internals import evaluate_equation, find_traced_function, find_user_line
+from switchfit.arrays import IntArray, Traced
+from switchfit.runtime.jax_internals import (
+    Atom,
+    ClosedJaxpr,
+    Equation,
+    Jaxpr,
+    array_type,
+    evaluate_equation,
+    find_traced_function,
+    find_user_line,
+)
 
-SELECTIONS: dict[str, Callable[[Any, Any], Any]] = {
+V = TypeVar("V")
+
+SELECTIONS: dict[str, Callable[[Traced, Mapping[str, Traced]], Traced]] = {
     "slice": lambda a, at: a[
         tuple(map(slice, at["start_indices"], at["limit_indices"], at["strides"] or a.ndim * [1]))
     ],
@@ -30,7 +42,12 @@ PUBLIC = (
 """Modules of JAX in which the name of a function is looked for."""
 
 
-def find_inner_jaxprs(equation: Any) -> list[Any]:
+def strip_constants(jaxpr: Jaxpr | ClosedJaxpr) -> Jaxpr:
+    """Return a jaxpr without the constants that a closed one carries."""
+    return cast("Jaxpr", getattr(jaxpr, "jaxpr", jaxpr))
+
+
+def find_inner_jaxprs(equation: Equation) -> list[Jaxpr | ClosedJaxpr]:
     """Return the jaxprs that an operation calls, with their constants or without.
 
     Parameters
@@ -42,7 +59,7 @@ def find_inner_jaxprs(equation: Any) -> list[Any]:
     return [entry for entry in every if hasattr(entry, "eqns")]
 
 
-def list_jaxprs(jaxpr: Any) -> Iterator[Any]:
+def list_jaxprs(jaxpr: Jaxpr) -> Iterator[Jaxpr]:
     """Yield a jaxpr and those inside it.
 
     Parameters
@@ -52,10 +69,10 @@ def list_jaxprs(jaxpr: Any) -> Iterator[Any]:
     yield jaxpr
     for equation in jaxpr.eqns:
         for inner in find_inner_jaxprs(equation):
-            yield from list_jaxprs(getattr(inner, "jaxpr", inner))
+            yield from list_jaxprs(strip_constants(inner))
 
 
-def evaluate(equation: Any, operands: Sequence[Any]) -> list[Any]:
+def evaluate(equation: Equation, operands: Sequence[Traced]) -> list[Traced]:
     """Return the results of an operation, by its own rule for derivatives if it has one.
 
     Parameters
@@ -66,22 +83,24 @@ def evaluate(equation: Any, operands: Sequence[Any]) -> list[Any]:
     return evaluate_equation(equation, operands)
 
 
-class Walk:
+class Walk(Generic[V]):
     """Follows values of any kind through a jaxpr, operation by operation: `apply` says what one makes of them."""
 
-    def constant(self, value: Any) -> Any:
-        """Return what stands for a constant."""
-        return value
+    def constant(self, value: Traced) -> V:
+        """Return what stands for a constant: itself, if that is what is followed."""
+        return cast("V", value)
 
-    def apply(self, equation: Any, given: list[Any], origin: Any) -> Sequence[Any]:
+    def apply(self, equation: Equation, given: list[V], origin: Equation) -> Sequence[V]:
         """Return the results of an operation; its place in the user's code is that of the operation `origin`."""
         raise NotImplementedError
 
-    def run(self, jaxpr: Any, consts: Sequence[Any], given: Sequence[Any], origin: Any = None) -> list[Any]:
+    def run(
+        self, jaxpr: Jaxpr, consts: Sequence[Traced], given: Sequence[V], origin: Equation | None = None
+    ) -> list[V]:
         """Return the results of a jaxpr."""
         known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(self.constant, consts), *given], strict=True))
 
-        def value(atom: Any) -> Any:
+        def value(atom: Atom) -> V:
             return self.constant(atom.val) if hasattr(atom, "val") else known[atom]
 
         for equation in jaxpr.eqns:
@@ -89,17 +108,17 @@ class Walk:
             known |= dict(zip(equation.outvars, results, strict=True))
         return [value(atom) for atom in jaxpr.outvars]
 
-    def enter(self, equation: Any, inner: Any, given: Sequence[Any], origin: Any) -> list[Any]:
+    def enter(self, equation: Equation, inner: Jaxpr | ClosedJaxpr, given: Sequence[V], origin: Equation) -> list[V]:
         """Return the results of a jaxpr that an operation calls.
 
         JAX traces its own functions once for all callers: what is inside them has the place of the call.
         """
-        jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+        jaxpr, consts = strip_constants(inner), getattr(inner, "consts", ())
         is_of_jax = origin is not equation or find_public_name(jaxpr) is not None
         return self.run(jaxpr, consts, given, origin if is_of_jax else None)
 
 
-def find_read_entries(jaxpr: Any, variables: Sequence[Any]) -> list[tuple[int, ...]]:
+def find_read_entries(jaxpr: Jaxpr, variables: Sequence[Atom]) -> list[tuple[int, ...]]:
     """Return the positions in some arguments of the entries that may be read: those that a jaxpr does more with than
     to move them, and to leave them out of slices.
 
@@ -108,7 +127,9 @@ def find_read_entries(jaxpr: Any, variables: Sequence[Any]) -> list[tuple[int, .
     jaxpr : jaxpr
     variables : sequence of its arguments
     """
-    held = {v: (k, np.arange(v.aval.size).reshape(v.aval.shape)) for k, v in enumerate(variables)}
+    held: dict[Atom, tuple[int, IntArray]] = {}
+    for k, v in enumerate(variables):
+        held[v] = k, np.arange(array_type(v).size).reshape(array_type(v).shape)
     read: list[set[int]] = [set() for _ in variables]
     for name, given, made, settings in (
         *((each.primitive.name, each.invars, each.outvars, each.params) for each in jaxpr.eqns),
@@ -122,7 +143,7 @@ def find_read_entries(jaxpr: Any, variables: Sequence[Any]) -> list[tuple[int, .
     return [tuple(sorted(positions)) for positions in read]
 
 
-def find_line(equation: Any) -> str:
+def find_line(equation: Equation) -> str:
     """Return file and line of the user's code from which an operation comes, "file.py:12"; empty if it is unknown.
 
     Parameters
@@ -133,7 +154,7 @@ def find_line(equation: Any) -> str:
     return "" if found is None else f"{os.path.basename(found[0])}:{found[1]}"
 
 
-def find_public_name(jaxpr: Any) -> str | None:
+def find_public_name(jaxpr: Jaxpr | ClosedJaxpr) -> str | None:
     """Return the public name of a function of JAX; None for any other function.
 
     JAX traces its functions once for all callers: the location of their inner operations may be that of another call,

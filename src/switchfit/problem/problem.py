@@ -1,4 +1,23 @@
-"""Problem: a system, the experiments made with it, and the parameters to estimate."""
+"""Problem: a system, the experiments made with it, and the parameters to estimate.
+
+A problem does not change once it is built. What follows from its arguments is found in this order, each from those
+before it:
+
+1. the arguments, checked: alone (`validation`), then against one another (`consistency`);
+2. `unknowns`: where each unknown stands in theta, with bounds, priors and the order of times;
+3. `structures`, one for each experiment: its functions, traced. A structure and the lengths of arrays decide which
+   compiled program is used;
+4. cached properties (`durations`, `constraints`, `places`, `alike`, ...), found when they are first asked for. None
+   depends on theta; methods that do (`vectors`, `split`, `check_theta`, ...) take it and cache nothing.
+
+So nothing that is cached can be stale: other data (`dataclasses.replace`) or other sequences (`with_sequences`) are
+another problem. The latter shares `_sources` with its origin, the functions that were traced; the former traces anew,
+or finds its traces by their content (`functions`).
+
+Other rooms keep with a problem what they find once for it, by `keep_with_problem`: its evaluator, its runs, the
+comparisons in its functions. That too lives as long as the problem, and does not travel: pickles, copies and
+`with_sequences` begin without it.
+"""
 
 from __future__ import annotations
 
@@ -152,6 +171,8 @@ class Problem:
         )
         if not SMALLEST_RTOL <= self.rtol < 1:
             raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
+        # The arguments against one another, before anything is traced: tracing may take seconds, and its messages are
+        # about functions.
         for run in experiments:
             check_names(run, self.parameters)
         states = [self.system.initial_state, *(run.initial_state for run in experiments)]
@@ -159,6 +180,7 @@ class Problem:
         if len(sizes) > 1:
             raise ValueError(f"initial_state must have as many entries in the system and all experiments; got {sizes}.")
         self._set_experiments(experiments)
+        # An initial state that is a function of p has a length only now that it is traced.
         for structure in self.structures:
             self.system.check_labels_of(structure.n)
         if not self.max_transitions:
@@ -174,11 +196,14 @@ class Problem:
             if most is not None and most < transitions:
                 raise ValueError(f"max_transitions is {most}, but a mode_sequence has {transitions} transitions.")
         unknowns = list_unknowns(self.system, experiments, self.parameters, self.durations)
+        # Two steps: tracing reads `_sources`, a cached property, and nothing of it depends on experiments.
         set_fields(self, experiments=experiments, unknowns=unknowns)
         set_fields(self, structures=tuple(trace_structure(self._sources, run, most) for run in experiments))
 
     def _check_noise(self) -> None:
         """Raise ValueError if something is weighed against noise that is unknown."""
+        # Without sigma J is a sum of squares in the unit of the data, whose minimum is that of the likelihood. A sum of
+        # it and a term without unit, such as a prior, has a minimum that depends on the unit.
         relative = self.unknowns.priors.any or not self.is_least_squares
         if relative and any(item.sigma is None for item in self.measurements):
             raise ValueError(
@@ -189,7 +214,10 @@ class Problem:
 
     @cached_property
     def _sources(self) -> Sources:
-        """What structures are traced from, with the functions that were traced; other sequences share it."""
+        """What structures are traced from, with the functions that were traced; other sequences share it.
+
+        A search of the mode sequence makes hundreds of problems of one: each function is then traced once.
+        """
         return Sources(self.system, self.parameters, self.solver, {})
 
     def with_sequences(self, sequences: Sequence[Sequence[str]], transition_times: Sequence[ArrayLike]) -> Problem:
@@ -228,6 +256,8 @@ class Problem:
             replace(run, mode_sequence=tuple(modes), transition_times=tuple(np.asarray(times, dtype=float).tolist()))
             for run, modes, times in given
         )
+        # Without `__post_init__`: the arguments were checked when this problem was built, and only the experiments
+        # differ.
         changed: Problem = object.__new__(Problem)
         set_fields(changed, **{name: getattr(self, name) for name in (*PROBLEM_ARGUMENTS, "_sources")})
         changed._set_experiments(experiments)
@@ -244,6 +274,8 @@ class Problem:
 
     def __setstate__(self, state: dict[str, Converted]) -> None:
         """Build the problem again; ValueError if a function does something else than when the problem was built."""
+        # Functions are traced anew in this process. A function of a module is pickled by its name alone: if the file
+        # has changed since, or a global that it reads, a worker would fit another model without this comparison.
         set_fields(self, **{name: state[name] for name in PROBLEM_ARGUMENTS})
         self.__post_init__()
         for structure, digests in zip(self.structures, state["digests"], strict=True):
@@ -305,6 +337,7 @@ class Problem:
         runs = zip(self.experiments, unknowns.times, strict=True)
         jumps = {(i, t) for run, times in runs for i in times.tolist() for t in run.jump_times.tolist() if t > run.t0}
 
+        # A bound at the time of a `Jump` is not one that the user gave (`Experiment.times`): messages say so.
         def name_bounds(kind: ConstraintKind, values: FloatArray) -> list[Constraint]:
             each = enumerate(zip(values.tolist(), unknowns.names, strict=True))
             return [Constraint("known jump" if (i, v) in jumps else kind, v, name) for i, (v, name) in each]
@@ -355,6 +388,7 @@ class Problem:
         """
         if not self.is_least_squares:
             return 0.5 * sum(item.count for item in self.measurements)
+        # 1e-300: data that are all zero have no size, and divisions by this cost have to be possible.
         squares = sum(float(np.nansum(item.weights * item.values**2)) for item in self.measurements)
         return max(0.5 * PERFECT_RESIDUAL**2 * squares, 1e-300)
 
@@ -405,7 +439,7 @@ class Problem:
         (array([2.]), array([0.5]))
         """
         places, N = self.places[e], self.structures[e].N
-        if self.one_to_one:
+        if self.one_to_one:  # the common case, at every step of the optimizer: views, no copies
             return theta[:N], theta[N:]
         tau, where = self.experiments[e].initial_times_with_jumps.copy(), places[:N]
         tau[where >= 0] = theta[where[where >= 0]]
@@ -422,6 +456,7 @@ class Problem:
     @cached_property
     def sample_lengths(self) -> tuple[tuple[int, ...], ...]:
         """For each experiment the lengths to which the samples of each of its Measurements are padded."""
+        # 1 at least: an `OnlineEstimator` starts with no samples, and programs take one of weight 0.
         counts = [[max(len(item.times), 1) for item in e.measurements] for e in self.experiments]
         for group in self.alike:
             for k in range(len(counts[group[0]])):
@@ -496,6 +531,8 @@ class Problem:
                 f"got shape {checked.shape}."
             )
         for e, (experiment, where) in enumerate(zip(self.experiments, self.unknowns.times, strict=True)):
+            # The order of times. A step of the optimizer onto a constraint may miss it by rounding, which is mended
+            # here, since rows of negative length have no meaning; more than rounding is a mistake of the caller.
             times = self._select_times(checked, e)
             knots = np.concatenate([[experiment.t0], times, [experiment.end]])
             shortest = (knots[1:] - knots[:-1]).min()
@@ -506,10 +543,13 @@ class Problem:
                     f"{experiment.end}){last}; got {shorten(times)}."
                 )
             if shortest < 0:  # by rounding: put in order, round the times that are fixed
+                # Free times between the fixed ones before and after them, which stay as they are.
                 low = np.maximum.accumulate(np.append(experiment.t0, np.where(where < 0, times, -np.inf)))[1:]
                 high = np.minimum.accumulate(np.append(np.where(where < 0, times, np.inf), experiment.end)[::-1])[::-1]
                 ordered = np.maximum.accumulate(np.clip(times, low, high[:-1]))
                 checked[where[where >= 0]] = ordered[where >= 0]
+            # Known jumps: each stays between the transitions between which it was at the guess, as the order of
+            # segments is part of the structure.
             for jump, n in zip(experiment.jump_times.tolist(), experiment.passed_by_jumps.tolist(), strict=True):
                 if (
                     knots[n] > jump + DISORDER_BY_ROUNDING * experiment.clock
@@ -520,6 +560,7 @@ class Problem:
                         f"guesses are; got {shorten(times)}, on another side of the jump at {jump:g}. Give the "
                         "Experiment transition_times on that side."
                     )
+            # Late samples: the states that they saw must lie on the trajectory.
             seen = self.late_times(checked, e)
             if seen.size and (seen.min() < experiment.t0 or seen.max() > experiment.earliest_end):
                 raise ValueError(
@@ -590,10 +631,17 @@ def place_parameters(problem: Problem, e: int, structure: Structure) -> IntArray
 
 
 def keep_with_problem(build: Callable[[Problem], T]) -> Callable[[Problem], T]:
-    """Let a function of a problem be called once for each problem, which keeps what it returned."""
+    """Let a function of a problem be called once for each problem, which keeps what it returned.
+
+    For what is found of a problem in a room above this one, where it cannot be a cached property. It is dropped with
+    the problem: there is no table of problems that would keep them, their data and their evaluators alive. It must
+    follow from the problem alone, since nothing asks for it anew.
+    """
 
     @wraps(build)
     def find(problem: Problem) -> T:
+        # The key is the function's name, so that a profile or a debugger shows what a problem holds: no two functions
+        # may share one, nor have that of an attribute of `Problem`. Two threads may both build it; the last one stays.
         if build.__name__ not in problem.__dict__:
             problem.__dict__[build.__name__] = build(problem)
         kept: T = problem.__dict__[build.__name__]

@@ -12,14 +12,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import count, pairwise
 from types import MappingProxyType
-from typing import Any
 
 import jax
 import numpy as np
 
-from switchfit.problem.jaxprs import Walk, find_inner_jaxprs, find_line
+from switchfit.arrays import Traced
+from switchfit.problem.jaxprs import Walk, find_inner_jaxprs, find_line, strip_constants
 from switchfit.problem.validation.precision import is_low_precision, refuse_single_precision
-from switchfit.runtime.jax_internals import is_user_file, list_calls
+from switchfit.runtime.jax_internals import ClosedJaxpr, Equation, array_type, is_user_file, list_calls
+
+Known = Traced
+"""A number or an array that does not depend on the arguments; None for one that does."""
 
 KEEPING = frozenset(
     {"slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "concatenate", "rev", "gather", "stack", "copy"}
@@ -37,7 +40,7 @@ DROPPED = jax.lax.GatherScatterMode.FILL_OR_DROP
 WRITER = "_IndexUpdateRef."
 """Class of JAX that ``x.at[index]`` is an object of, at the beginning of the names of its methods."""
 
-FOLDED: Mapping[str, Callable[..., Any]] = MappingProxyType(
+FOLDED: Mapping[str, Callable[..., Traced]] = MappingProxyType(
     {
         "lt": lambda a, b, **_: np.less(a, b),
         "add": lambda a, b, **_: np.add(a, b),
@@ -53,7 +56,7 @@ FOLDED: Mapping[str, Callable[..., Any]] = MappingProxyType(
 """Operations by which JAX makes what it reads of a constant index; in NumPy, which compiles nothing."""
 
 
-def refuse_wrong_constants(closed: Any, what: str) -> None:
+def refuse_wrong_constants(closed: ClosedJaxpr, what: str) -> None:
     """Raise ValueError if a traced function uses numbers that lost digits, computes in less than double precision, or
     reads or writes an array at a constant index that it does not have.
 
@@ -67,22 +70,22 @@ def refuse_wrong_constants(closed: Any, what: str) -> None:
     _Constants(what).run(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars))
 
 
-class _Constants(Walk):
+class _Constants(Walk[Known]):
     """Follows known numbers, and None for unknown ones, and checks them."""
 
     def __init__(self, what: str) -> None:
         self._what = what
 
-    def apply(self, equation: Any, given: list[Any], origin: Any) -> Sequence[Any]:
+    def apply(self, equation: Equation, given: list[Known], origin: Equation) -> Sequence[Known]:
         for number in given:
             refuse_single_precision(number, f"a constant of {self._what}{_locate(origin)}")
         inner = find_inner_jaxprs(equation)
-        results: Sequence[Any] = [None] * len(equation.outvars)
+        results: Sequence[Known] = [None] * len(equation.outvars)
         for jaxpr in inner:
             if equation.primitive.name == "jit":  # a plain call; loops and branches without known arguments
                 results = self.enter(equation, jaxpr, given, origin)
             else:
-                self.enter(equation, jaxpr, [None] * len(getattr(jaxpr, "jaxpr", jaxpr).invars), origin)
+                self.enter(equation, jaxpr, [None] * len(strip_constants(jaxpr).invars), origin)
         if not inner:
             self._check_precision(equation, origin)
             if all(operand is not None for operand in given):
@@ -90,14 +93,14 @@ class _Constants(Walk):
         self._check_indices(equation, given, origin)
         return results
 
-    def _evaluate(self, equation: Any, given: list[Any]) -> Sequence[Any]:
+    def _evaluate(self, equation: Equation, given: list[Known]) -> Sequence[Known]:
         """Return the results of an operation of known numbers that may make an index."""
-        fold, kind = FOLDED.get(equation.primitive.name), getattr(equation.outvars[0].aval.dtype, "kind", "O")
+        fold, kind = FOLDED.get(equation.primitive.name), getattr(array_type(equation.outvars[0]).dtype, "kind", "O")
         if fold is None or kind not in "iub":
             return [None] * len(equation.outvars)
         return [fold(*given, **equation.params)]
 
-    def _check_precision(self, equation: Any, origin: Any) -> None:
+    def _check_precision(self, equation: Equation, origin: Equation) -> None:
         """Raise ValueError if an operation computes in less than double precision."""
         kinds = (getattr(variable.aval, "dtype", np.float64) for variable in equation.outvars)
         short = list(filter(is_low_precision, kinds))
@@ -107,11 +110,11 @@ class _Constants(Walk):
                 "are float64, do not cast them, and write constants as numbers or NumPy arrays."
             )
 
-    def _check_indices(self, equation: Any, given: list[Any], origin: Any) -> None:
+    def _check_indices(self, equation: Equation, given: list[Known], origin: Equation) -> None:
         """Raise ValueError for a known index of an operation that is out of range."""
         verb = "reads index" if equation.primitive.name in ("dynamic_slice", "gather") else "writes to index"
         for start, axis, size in _list_indices(equation, given):
-            shape = equation.invars[0].aval.shape
+            shape = array_type(equation.invars[0]).shape
             n, starts = shape[axis], np.ravel(start)
             wrong = starts[(starts < 0) | (starts > n - size)]
             if wrong.size:
@@ -122,20 +125,20 @@ class _Constants(Walk):
                 )
 
 
-def _locate(equation: Any) -> str:
+def _locate(equation: Equation) -> str:
     """Return the location of an operation as the end of a sentence, " (file.py:12)"; empty if it is unknown."""
     where = find_line(equation)
     return f" ({where})" if where else ""
 
 
-def _list_indices(equation: Any, given: list[Any]) -> Iterator[tuple[Any, int, int]]:
+def _list_indices(equation: Equation, given: list[Known]) -> Iterator[tuple[Known, int, int]]:
     """Yield the known indices of an operation, the axis of each, and the number of entries from it on."""
     name, params = equation.primitive.name, equation.params
-    found: Iterable[tuple[Any, int, int]] = ()
+    found: Iterable[tuple[Known, int, int]] = ()
     if name == "dynamic_slice":
         found = zip(given[1:], count(), params["slice_sizes"], strict=False)
     elif name == "dynamic_update_slice":
-        found = zip(given[2:], count(), equation.invars[1].aval.shape, strict=False)
+        found = zip(given[2:], count(), array_type(equation.invars[1]).shape, strict=False)
     elif name == "gather" and params["mode"] is PROMISED and given[1] is not None:
         axes = params["dimension_numbers"].start_index_map
         found = ((np.asarray(given[1])[..., k], axis, params["slice_sizes"][axis]) for k, axis in enumerate(axes))
@@ -145,7 +148,7 @@ def _list_indices(equation: Any, given: list[Any]) -> Iterator[tuple[Any, int, i
     yield from (each for each in found if each[0] is not None)
 
 
-def _is_update(equation: Any) -> bool:
+def _is_update(equation: Equation) -> bool:
     """Return whether a scatter is an update of the user, ``x.at[index].set(value)``, and not one by JAX, as derivatives
     of ``x.at[index].get(mode="fill")`` are.
     """

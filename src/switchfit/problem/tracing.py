@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise, product
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.arrays import Traced
 from switchfit.problem.corners.outputs import choose_sides
 from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost, TransitionCost
 from switchfit.problem.experiment import Experiment, initial_state_of, insert_jumps
@@ -18,10 +19,12 @@ from switchfit.problem.measurements import Measurements
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.reference_signals import ReferenceSignal
 from switchfit.problem.structure import REST, Sensor, Structure
-from switchfit.problem.system import AtTransitions, HybridSystem
+from switchfit.problem.system import AtTransitions, HybridSystem, InitialState
+
+Item = TypeVar("Item")
 
 
-def stay_at_rest(t: Any, x: Any, p: Any, u: Any = None) -> Any:
+def stay_at_rest(t: Traced, x: Traced, p: Mapping[str, Traced], u: Traced = None) -> Traced:
     """Return the vector field after a free tf: 0, so that x remains x(tf)."""
     return jnp.zeros_like(x)
 
@@ -32,7 +35,7 @@ class Sources(NamedTuple):
     system: HybridSystem
     parameters: Mapping[str, Parameter]
     solver: Literal["auto", "explicit", "stiff"]
-    traced: dict[Any, Function]
+    traced: dict[Hashable, Function]
 
 
 class _Tracer:
@@ -53,9 +56,17 @@ class _Tracer:
         self.read: dict[str, set[int]] = {}
         self._traced, self._key = sources.traced, tuple(self.shapes.items())
 
-    def __call__(self, *given: Any) -> Function:
+    def __call__(
+        self,
+        function: Callable[..., Traced],
+        arguments: tuple[Shape | None, ...],
+        shape: Shape | None,
+        what: str,
+        form: str,
+        inputs: tuple[str, ...] = (),
+    ) -> Function:
         """Trace a function, given what a `Call` consists of."""
-        call = Call(*given)
+        call = Call(function, arguments, shape, what, form, inputs)
         key = (id(call.function), call[1:], self._key)
         traced = self._traced.get(key)
         if traced is None:
@@ -82,7 +93,7 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
     names = tuple(name for name in system.modes if name in used)  # in the same order for every sequence
     x0, n, unknown = _trace_initial_state(trace, initial_state_of(system, experiment))
 
-    def items(kind: type) -> list[Any]:
+    def items(kind: type[Item]) -> list[Item]:
         return [item for item in experiment.data if isinstance(item, kind)]
 
     at: tuple[Shape | None, ...] = ((), (n,), None)
@@ -91,7 +102,7 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
     in_mode, form = (at, "f(t, x, p)") if inputs is None else ((*at, inputs), "f(t, x, p, u)")
 
     end = [None] if experiment.has_free_tf else []  # the transition to rest, which has no functions
-    own: list[Any] = [*pairwise(experiment.mode_sequence), *end]
+    own: list[tuple[str, str] | None] = [*pairwise(experiment.mode_sequence), *end]
 
     def at_transitions(
         given: AtTransitions, shape: Shape, what: str, form: str, at_jumps: Sequence[Function | None] = ()
@@ -99,7 +110,8 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
         """Return the function of each transition and jump, None for one without, and those of all possible ones."""
         here = given if transitions is not None else own
         traced = {pair: trace(g, at, shape, f"{what} {pair}", form) for pair, g in given.items() if pair in here}
-        found = insert_jumps(experiment, [traced.get(pair) for pair in own], at_jumps or [None] * len(jump_maps))
+        of_transitions = [traced.get(pair) if pair else None for pair in own]
+        found = insert_jumps(experiment, of_transitions, at_jumps or [None] * len(jump_maps))
         return tuple(found), tuple(dict.fromkeys([*traced.values(), *filter(None, at_jumps)]))
 
     modes = tuple(trace(system.modes[name], in_mode, (n,), f"mode {name!r}", form, input_names) for name in names)
@@ -145,7 +157,7 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
     return replace(structure, parameters=_select_parameters(trace, structure))
 
 
-def _trace_initial_state(trace: _Tracer, initial: Any) -> tuple[Function | None, int, tuple[int, ...]]:
+def _trace_initial_state(trace: _Tracer, initial: InitialState) -> tuple[Function | None, int, tuple[int, ...]]:
     """Return the function x0(p), None for an array; the number of states; and which entries are estimated."""
     if not callable(initial):
         return None, len(initial), tuple(k for k, x in enumerate(initial) if not getattr(x, "fixed", True))

@@ -15,16 +15,18 @@ that at the margin.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache
 from itertools import product
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from switchfit.problem.corners.walk import Array, CornerWalk, has_corners, join_entries
+from switchfit.arrays import Traced
+from switchfit.problem.corners.walk import CornerWalk, has_corners, join_entries
 from switchfit.problem.functions import Function, use_float64
+
+Array = jax.Array
 
 Sides = tuple[int, ...]
 """Side of each corner of a mode: +1, -1, or 0 where the trajectory slides."""
@@ -67,7 +69,7 @@ class Corners:
         self.count = len(known)
         self.lines = [lines[k] for k in firsts]
         self._firsts = firsts
-        self._derived: dict[Any, Function] = {}
+        self._derived: dict[tuple[Hashable, Sides], Function] = {}
 
     def branch(self, sides: Sides) -> Function:
         """Return the mode with these sides."""
@@ -124,21 +126,21 @@ class Corners:
         """Return the function of one of the ends of a branch, ()."""
         return self._derive(("end", which), sides, lambda *given: self._ends(sides, given)[which])
 
-    def _derive(self, what: Any, sides: Sides, evaluate: Any) -> Function:
+    def _derive(self, what: Hashable, sides: Sides, evaluate: Callable[..., Traced]) -> Function:
         key = what, sides
         if key not in self._derived:
             with use_float64():
                 self._derived[key] = self.function.derive(evaluate)
         return self._derived[key]
 
-    def _run(self, sides: Sequence[int] | None, given: Sequence[Any]) -> tuple[CornerWalk, Any]:
+    def _run(self, sides: Sequence[int] | None, given: Sequence[Array]) -> tuple[CornerWalk, Array]:
         walk, function = CornerWalk(sides), self.function
         with use_float64():
             arguments = [walk.argument(k, value) for k, value in enumerate(given)]  # the state comes after t
             results = walk.run(function.jaxpr, function.consts, arguments)
         return walk, jnp.asarray(join_entries(results[0].value))
 
-    def _evaluate(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
+    def _evaluate(self, sides: Sides, given: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return f (n,), and g of each corner."""
         # Members of a group compare the same two numbers, maybe in the other order: `o` is -1 then.
         members = [o * sides[g] for g, o in zip(self._group, self._orientation, strict=True)]
@@ -147,7 +149,7 @@ class Corners:
         walk, f = self._run(members, [t, x, *own])
         return f, [a - b for a, b in (walk.values[k] for k in self._firsts)]
 
-    def _field(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
+    def _field(self, sides: Sides, given: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the field of a branch (n,), and s of its sliding corners."""
         sliding, (f, *others) = self._slide(sides, given)
         if not sliding:
@@ -159,7 +161,7 @@ class Corners:
         s = _solve(A, [-rate[0][i] for i in range(len(sliding))])
         return f + sum(each * (other - f) for each, other in zip(s, others, strict=True)), s
 
-    def _slide(self, sides: Sides, given: Sequence[Any]) -> tuple[list[int], list[Array]]:
+    def _slide(self, sides: Sides, given: Sequence[Array]) -> tuple[list[int], list[Array]]:
         """Return the sliding corners; f_0 with side -1 at all of them, and f_k with side +1 at one of them alone."""
         sliding, base = [k for k, side in enumerate(sides) if side == 0], _settle(sides)
         every = base, *((*base[:k], 1, *base[k + 1 :]) for k in sliding)
@@ -192,14 +194,14 @@ class Corners:
 
         return self._derive("guard", sides, evaluate)
 
-    def _move(self, sides: Sides, corner: int, target: Any, given: Sequence[Any]) -> Array:
+    def _move(self, sides: Sides, corner: int, target: Array | float, given: Sequence[Array]) -> Array:
         """Return the state nearest to x at which g of a corner is the target, to first order in g: (n,)."""
         t, x, *others = given
         g, gradient = jax.value_and_grad(lambda x: self.surfaces(sides).evaluate([t, x, *others])[corner])(x)
         square = jnp.sum(gradient**2)
         return x - (g - target) * gradient / jnp.where(square > 0, square, 1.0)
 
-    def _rates(self, sides: Sides, f: Array, given: Sequence[Any]) -> Array:
+    def _rates(self, sides: Sides, f: Array, given: Sequence[Array]) -> Array:
         """Return D_t g + D_x g . f + D_u g . du/dt of all corners: (count,)."""
         t, x, *others = given
         moving, rates = [t, x], [jnp.ones_like(t), f]
@@ -210,7 +212,7 @@ class Corners:
         surfaces = lambda *moving: self.surfaces(sides).evaluate([*moving, *others])  # noqa: E731
         return jax.jvp(surfaces, moving, rates)[1]
 
-    def _ends(self, sides: Sides, given: Sequence[Any]) -> list[Array]:
+    def _ends(self, sides: Sides, given: Sequence[Array]) -> list[Array]:
         g = self.surfaces(sides).evaluate(given)
         s = iter(self._field(sides, given)[1])
         # Of a corner with a side: side g, positive inside. Of a sliding one: s and 1 - s, the limits of the convex
@@ -236,7 +238,7 @@ def _settle(sides: Sides) -> Sides:
     return tuple(side or -1 for side in sides)
 
 
-def _solve(A: list[list[Any]], b: list[Any]) -> list[Any]:
+def _solve(A: list[list[Array]], b: list[Array]) -> list[Array]:
     """Solve linear equations by elimination, without pivoting: A_kk < 0 where corner k attracts from both sides."""
     (pivot, *right), *rest = A
     parts = [row[0] / pivot for row in rest]

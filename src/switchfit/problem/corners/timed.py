@@ -8,21 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.problem.corners.walk import CORNER_PRIMITIVES, MOST_KNOTS, ROUNDED, Array, has_corners
+from switchfit.arrays import Traced
+from switchfit.problem.corners.walk import CORNER_PRIMITIVES, MOST_KNOTS, ROUNDED, has_corners
 from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.jaxprs import Walk, evaluate
+from switchfit.runtime.jax_internals import Equation, array_type
+
+Array = jax.Array
 
 NO_CALLS = frozenset({"scan", "while", "reduce", "reduce_window"})
 """Operations that do not run a jaxpr once, for their own operands."""
 
 
-class _Timed(Walk):
+class _Timed(Walk[Array | None]):
     """Evaluates what follows from t, the input and fixed parameters; None stands for all else.
 
     Attributes
@@ -33,7 +36,7 @@ class _Timed(Walk):
     def __init__(self) -> None:
         self.gaps: tuple[list[Array], list[Array]] = [], []
 
-    def apply(self, equation: Any, given: list[Any], origin: Any) -> Sequence[Any]:
+    def apply(self, equation: Equation, given: list[Traced], origin: Equation) -> Sequence[Traced]:
         name, params = equation.primitive.name, equation.params
         is_search, inner = params.get("name") == "searchsorted", params.get("jaxpr", params.get("call_jaxpr"))
         if name == "cond":
@@ -45,7 +48,7 @@ class _Timed(Walk):
             return [None] * len(equation.outvars)
         if is_search and np.shape(given[0]) <= (MOST_KNOTS,):
             self.gaps[0].append(given[1][..., None] - given[0])
-        elif name in CORNER_PRIMITIVES and equation.invars[-1].aval.dtype == np.float64:
+        elif name in CORNER_PRIMITIVES and array_type(equation.invars[-1]).dtype == np.float64:
             a, *others = given[1:2] + given[::2] if name == "clamp" else given
             gaps = [a - b for b in others or [0.0]]
             gaps = [jnp.sin(np.pi * (a + ROUNDED[name][0]))] if name in ROUNDED else gaps

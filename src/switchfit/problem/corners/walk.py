@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from itertools import count, islice
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +12,13 @@ import numpy as np
 from jax import lax
 from numpy.typing import NDArray
 
-from switchfit.problem.jaxprs import SELECTIONS, Walk, evaluate, find_line, list_jaxprs
+from switchfit.arrays import BoolArray, Traced
+from switchfit.problem.jaxprs import SELECTIONS, Walk, evaluate, find_line, list_jaxprs, strip_constants
 from switchfit.problem.traced_constants import FOLDED
-from switchfit.runtime.jax_internals import keep_user_line
+from switchfit.runtime.jax_internals import ClosedJaxpr, Equation, Jaxpr, array_type, keep_user_line
 
-Array = Any
+Names = NDArray[np.int64]
+"""Numbers that stand for expressions: two values have one number if they are one expression of t, x and p."""
 
 ROUNDED = {"floor": (0.0, 0.0), "ceil": (0.0, 1.0), "round": (0.5, 0.0)}
 """Operations that are ``floor(x + shift) + more`` between their jumps: shift and more."""
@@ -38,7 +40,7 @@ MOST_ENTRIES = 64
 MOST_KNOTS = 16
 """Most knots of a table that are corners. A longer one is nearly smooth, and its knots are passed all the time."""
 
-NO_NAME = np.zeros((), dtype=np.int64)
+NO_NAME: Names = np.zeros((), dtype=np.int64)
 
 
 class _Entries(NamedTuple):
@@ -59,12 +61,12 @@ class _Value(NamedTuple):
         Of each entry; two are equal if they are one expression of t, x and p, whatever the sides are.
     """
 
-    value: Any
+    value: Traced  # or _Entries
     moves: bool
-    names: NDArray[Any]
+    names: Names
 
 
-class CornerWalk(Walk):
+class CornerWalk(Walk[_Value]):
     """Evaluates a jaxpr with given sides of its corners, and lists their functions g; without sides, all are +1.
 
     Entries of a vector may be on different sides of a corner: each is followed by itself, so that nothing that is not
@@ -79,16 +81,16 @@ class CornerWalk(Walk):
 
     def __init__(self, sides: Sequence[int] | None) -> None:
         self._sides = sides
-        self.values: list[Array] = []
+        self.values: list[tuple[Traced, Traced]] = []
         self.pairs: list[tuple[int, int]] = []
         self.lines: list[str] = []
-        self._known: dict[Any, int] = {}
+        self._known: dict[Hashable, int] = {}
 
-    def argument(self, k: int, value: Any) -> _Value:
+    def argument(self, k: int, value: Traced) -> _Value:
         """Return the k-th argument of a mode."""
         return _Value(value, k == 1, self._list_names(np.shape(value), (("argument", k, i) for i in count())))
 
-    def constant(self, value: Any) -> _Value:
+    def constant(self, value: Traced) -> _Value:
         """Return a constant as an array of NumPy, unless it is a random key."""
         if isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended):
             return _Value(value, False, self._list_names(value.shape, (("key", id(value), i) for i in count())))
@@ -96,7 +98,7 @@ class CornerWalk(Walk):
         entries = (("constant", str(array.dtype), entry) for entry in array.ravel().tolist())
         return _Value(array, False, self._list_names(array.shape, entries))
 
-    def _list_names(self, shape: tuple[int, ...], keys: Iterable[Any]) -> NDArray[Any]:
+    def _list_names(self, shape: tuple[int, ...], keys: Iterable[Hashable]) -> Names:
         """Return an array of numbers, the same for the same key; only where the corners are looked for."""
         if self._sides is not None:
             return NO_NAME
@@ -104,7 +106,7 @@ class CornerWalk(Walk):
         found = [self._known.setdefault(key, len(self._known)) for key in islice(keys, size)]
         return np.array(found, dtype=np.int64).reshape(shape)
 
-    def _name(self, equation: Any, given: list[_Value]) -> list[NDArray[Any]]:
+    def _name(self, equation: Equation, given: list[_Value]) -> list[Names]:
         """Return the names of the results of an operation."""
         name, params, names = equation.primitive.name, equation.params, [each.names for each in given]
         if self._sides is not None:
@@ -119,11 +121,11 @@ class CornerWalk(Walk):
             operands = zip(*(each.ravel().tolist() for each in every), strict=True)
             return [self._list_names(every[0].shape, ((what, own) for own in operands))]
         whole = tuple((each.shape, *each.ravel().tolist()) for each in names)
-        outs = enumerate(out.aval.shape for out in equation.outvars)
+        outs = enumerate(array_type(out).shape for out in equation.outvars)
         return [self._list_names(shape, ((what, whole, i, k) for k in count())) for i, shape in outs]
 
-    def apply(self, equation: Any, given: list[_Value], origin: Any) -> list[_Value]:
-        """Return the results of one operation, and register the corners that it makes."""
+    def apply(self, equation: Equation, given: list[_Value], origin: Equation) -> list[_Value]:
+        """Return the results of an operation on the given sides, and note the corners that it makes."""
         name, params, names = equation.primitive.name, equation.params, self._name(equation, given)
         depends = [each.moves for each in given]
         is_array = 1 < max((np.size(_get_array(each.value)) for each in given), default=1) <= MOST_ENTRIES
@@ -158,10 +160,10 @@ class CornerWalk(Walk):
         made = [np.asarray(value) if isinstance(value, np.generic) else value for value in made]
         return [_Value(value, any(depends), own) for value, own in zip(made, names, strict=True)]
 
-    def _apply_by_entry(self, equation: Any, given: list[_Value], origin: Any) -> _Entries:
+    def _apply_by_entry(self, equation: Equation, given: list[_Value], origin: Equation) -> _Entries:
         """Return the result of an operation of arrays, entry by entry."""
-        shape = equation.outvars[0].aval.shape
-        split = [[np.broadcast_to(each, shape) for each in (_split(own.value), own.names)] for own in given]
+        shape = array_type(equation.outvars[0]).shape
+        split = [(np.broadcast_to(_split(own.value), shape), np.broadcast_to(own.names, shape)) for own in given]
         found = np.empty(shape, dtype=object)
         for place in np.ndindex(shape):
             entries = [
@@ -171,10 +173,10 @@ class CornerWalk(Walk):
             found[place] = self.apply(equation, entries, origin)[0].value
         return _Entries(found)
 
-    def _evaluate(self, equation: Any, given: list[_Value], origin: Any) -> list[Any] | None:
+    def _evaluate(self, equation: Equation, given: list[_Value], origin: Equation) -> list[Traced] | None:
         """Return the results of an operation that the sides decide; None for any other."""
         name, values, moves = equation.primitive.name, [each.value for each in given], [each.moves for each in given]
-        if name in CORNER_PRIMITIVES and any(moves) and equation.invars[-1].aval.dtype == np.float64:
+        if name in CORNER_PRIMITIVES and any(moves) and array_type(equation.invars[-1]).dtype == np.float64:
             return [self._pass_corner(name, given, origin)]
         is_search = equation.params.get("name") == "searchsorted" and moves[-1] and not moves[0]
         # A table that is looked up by the state is smooth between its knots: each knot is a corner.
@@ -182,7 +184,7 @@ class CornerWalk(Walk):
             names = np.broadcast_to(given[0].names, np.shape(values[0]))
             knots = [_Value(values[0][k, ...], False, names[k, ...]) for k in range(len(names))]
             below = [self._meet(given[1], knot, origin) for knot in knots]
-            return [np.sum(below, axis=0).astype(equation.outvars[0].aval.dtype)]
+            return [np.sum(below, axis=0).astype(array_type(equation.outvars[0]).dtype)]
         if values and all(isinstance(value, np.ndarray) for value in values):  # also the sides of corners
             with jax.ensure_compile_time_eval():
                 return [np.asarray(value) for value in _bind(equation, values, origin)]
@@ -191,7 +193,7 @@ class CornerWalk(Walk):
             return [_choose(values[0], *values[1:])]
         return None
 
-    def _pass_corner(self, name: str, given: list[_Value], origin: Any) -> Any:
+    def _pass_corner(self, name: str, given: list[_Value], origin: Equation) -> Traced:
         """Return the result of an operation on the sides given."""
         shape = np.broadcast_shapes(*(np.shape(each.value) for each in given))
         given = [each._replace(value=_broadcast(each.value, shape)) for each in given]
@@ -217,7 +219,7 @@ class CornerWalk(Walk):
             return _choose(is_above, *((b, a) if name == "max" else (a, b)))
         return is_above if name in ("gt", "ge") else ~is_above
 
-    def _meet(self, one: _Value, other: _Value, origin: Any) -> Any:
+    def _meet(self, one: _Value, other: _Value, origin: Equation) -> BoolArray:
         """Note the corners a - b = 0, and return whether each is met on its positive side."""
         a, first = one.value, len(self.values)
         b, size = _broadcast(other.value, a.shape), int(np.prod(a.shape))
@@ -229,11 +231,11 @@ class CornerWalk(Walk):
         return (np.array(sides) > 0).reshape(a.shape)
 
 
-def _get_array(value: Any) -> Any:
+def _get_array(value: Traced) -> Traced:
     return value.array if isinstance(value, _Entries) else value
 
 
-def _split(value: Any) -> NDArray[np.object_]:
+def _split(value: Traced) -> NDArray[np.object_]:
     """Return the entries of an array, or those that it has been split into."""
     if isinstance(value, _Entries):
         return value.array
@@ -243,7 +245,7 @@ def _split(value: Any) -> NDArray[np.object_]:
     return found
 
 
-def join_entries(value: Any) -> Any:
+def join_entries(value: Traced) -> Traced:
     """Return entries as one array, which is one of NumPy if all are known; any other value as it is."""
     if not isinstance(value, _Entries):
         return value
@@ -252,7 +254,7 @@ def join_entries(value: Any) -> Any:
     return (np if known else jnp).stack(entries).reshape(value.array.shape)
 
 
-def _choose(which: Any, no: Any, yes: Any, *more: Any) -> Any:
+def _choose(which: NDArray[np.generic], no: Traced, yes: Traced, *more: Traced) -> Traced:
     """Return ``select_n`` of a condition that is known; without the other case where all entries take the same."""
     cases = [_broadcast(case, which.shape or np.shape(no)) for case in (no, yes, *more)]  # one condition, many entries
     if np.all(which == which.flat[0]):
@@ -261,18 +263,18 @@ def _choose(which: Any, no: Any, yes: Any, *more: Any) -> Any:
     return lax.select_n(which, *map(jnp.asarray, cases))
 
 
-def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
+def _broadcast(value: Traced, shape: tuple[int, ...]) -> Traced:
     """Return an array of a shape, which is one of NumPy if it is known."""
     return (np if isinstance(value, np.ndarray) else jnp).broadcast_to(value, shape)
 
 
-def _bind(equation: Any, values: Sequence[Any], origin: Any) -> list[Any]:
+def _bind(equation: Equation, values: Sequence[Traced], origin: Equation) -> list[Traced]:
     """Evaluate an operation as JAX does, with the line of the user's code from which it comes."""
     with keep_user_line(origin):
         return evaluate(equation, values)
 
 
-def has_corners(jaxpr: Any) -> bool:
+def has_corners(jaxpr: Jaxpr | ClosedJaxpr) -> bool:
     """Return whether a corner may be in a jaxpr, or in one inside it."""
-    every = list_jaxprs(getattr(jaxpr, "jaxpr", jaxpr))
+    every = list_jaxprs(strip_constants(jaxpr))
     return any(equation.primitive.name in CORNER_PRIMITIVES for each in every for equation in each.eqns)
