@@ -201,9 +201,9 @@ test_wrong_values = refused_with(
     (lambda: sf.evaluate(with_data(BROKEN)), ["a running cost in mode 'grow' returned nan at t = 0.3", "x = ["]),
     (lambda: sf.evaluate(starting_at(lambda p: [jnp.sqrt(-p["k"])])), ["at p = {'k': 1.0} returned [nan]"]),
     # Calls
-    (lambda: sf.evaluate(GOOD, method="backward"), ["one of auto, forward, adjoint"]),
-    (lambda: sf.evaluate(GOOD, method="autodiff"), ["one of auto, forward, adjoint"]),
-    (lambda: sf.evaluate(GOOD, method="discrete-adjoint"), ["one of auto, forward, adjoint"]),
+    (lambda: sf.evaluate(GOOD, method="backward"), ["'auto', 'forward' or 'adjoint'"]),
+    (lambda: sf.evaluate(GOOD, method="autodiff"), ["'auto', 'forward' or 'adjoint'"]),
+    (lambda: sf.evaluate(GOOD, method="discrete-adjoint"), ["'auto', 'forward' or 'adjoint'"]),
     error=ValueError,
 )
 

@@ -24,7 +24,7 @@ from switchfit.engine.native.tracing.meanings import get_meaning, select_case
 from switchfit.engine.native.tracing.moves import MOVING_OPERATIONS
 from switchfit.engine.native.tracing.rules import ARRAY_RULES
 from switchfit.engine.native.tracing.unsupported import Unsupported
-from switchfit.problem.jaxprs import Walk, find_line, find_public_name, list_jaxprs
+from switchfit.problem.jaxprs import Walk, find_line, find_public_name, list_jaxprs, strip_constants
 from switchfit.runtime.jax_internals import ClosedJaxpr, Equation, Jaxpr, array_type, drop_unused
 
 __all__ = ["Unsupported", "trace_scalars"]
@@ -90,7 +90,7 @@ class _Tracing(Walk):
 
 def _run(graph: Graph, inner: Jaxpr | ClosedJaxpr, inputs: Sequence[TracedArray]) -> list[TracedArray]:
     """Return the results of a jaxpr that an operation calls, with its constants or without."""
-    jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+    jaxpr, consts = strip_constants(inner), getattr(inner, "consts", ())
     return _Tracing(graph).run(jaxpr, consts, [as_numpy(value) for value in inputs])
 
 
