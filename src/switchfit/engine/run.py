@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Container
-from dataclasses import replace
 from functools import cached_property
 
 from switchfit.arrays import FloatArray
@@ -15,13 +13,6 @@ from switchfit.problem.corners.times import find_corner_times
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.structure import Structure
-
-
-def take_implicit_steps(structure: Structure, modes: Container[str]) -> Structure:
-    """Return a structure in which these modes take implicit steps too; itself if they do already."""
-    named = zip(structure.mode_names, structure.implicit, strict=True)
-    implicit = tuple(is_set or name in modes for name, is_set in named)
-    return structure if implicit == structure.implicit else replace(structure, implicit=implicit)
 
 
 class Run:
@@ -79,7 +70,7 @@ class Run:
 
     def get_structure(self, mesh: Mesh) -> Structure:
         """Return its structure with the method of the steps of each mode on a mesh."""
-        return take_implicit_steps(self.structure, [each.mode for each in mesh.stiffness])
+        return self.structure.take_implicit_steps([each.mode for each in mesh.stiffness])
 
 
 @keep_with_problem

@@ -399,10 +399,11 @@ class Problem:
         Jumps are among the N, as transitions at fixed times.
         """
         runs = enumerate(zip(self.experiments, self.unknowns.times, self.structures, strict=True))
-        return tuple(
-            np.concatenate([insert_jumps(run, own, repeat(-1)), place_parameters(self, e, structure)]).astype(np.intp)
-            for e, (run, own, structure) in runs
-        )
+        found = []
+        for e, (run, times, structure) in runs:
+            p = self.unknowns.place(e, structure.parameters, run.parameter_map)
+            found.append(np.concatenate([insert_jumps(run, times, repeat(-1)), p]).astype(np.intp))
+        return tuple(found)
 
     @cached_property
     def own_places(self) -> list[tuple[IntArray, IntArray]]:
@@ -618,16 +619,6 @@ class Problem:
             name: theta[spans[name]].reshape(q.shape) if name in spans else q.value
             for name, q in self.parameters.items()
         }
-
-
-def place_parameters(problem: Problem, e: int, structure: Structure) -> IntArray:
-    """Return the positions in theta of the p (M,) of a structure of experiment e."""
-    mapped, states = problem.experiments[e].parameter_map, problem.unknowns.initial_states[e]
-    parts = [states[:0]]
-    for name, _, read in structure.parameters:
-        if read:
-            parts.append(problem.unknowns.parameters[mapped.get(name, name)].start + np.array(read))
-    return np.concatenate([*parts, states[states >= 0]]).astype(np.intp)
 
 
 def keep_with_problem(build: Callable[[Problem], T]) -> Callable[[Problem], T]:

@@ -7,6 +7,7 @@ share one program, and nothing is recompiled when transition times, parameters o
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
@@ -121,6 +122,12 @@ class Structure:
             transition_costs=self.transition_cost_library,
             jumps=(),
         )
+
+    def take_implicit_steps(self, modes: Container[str]) -> Structure:
+        """Return the structure in which these modes take implicit steps too; itself if they do already."""
+        named = zip(self.mode_names, self.implicit, strict=True)
+        implicit = tuple(is_set or name in modes for name, is_set in named)
+        return self if implicit == self.implicit else replace(self, implicit=implicit)
 
     @property
     def resets(self) -> tuple[int, ...]:

@@ -7,7 +7,7 @@ Everything that is fixed stays out of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.problem.constraints import Constraint, ConstraintKind
 from switchfit.problem.experiment import Experiment, initial_state_of, name_runs, prefix_runs
+from switchfit.problem.functions import Shape
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.system import HybridSystem
@@ -97,6 +98,19 @@ class Unknowns:
     def log_times(self) -> BoolArray:
         """Which of the unknowns are transition times, or a free tf, on a logarithmic scale: (d,)."""
         return self.log & self.is_time
+
+    def place(
+        self, e: int, read: Iterable[tuple[str, Shape, tuple[int, ...]]], mapped: Mapping[str, str]
+    ) -> NDArray[np.intp]:
+        """Return the positions in theta of the p (M,) of experiment e: of the entries of parameters that a structure
+        reads, under names that the experiment maps to those of the problem, then of free initial states.
+        """
+        states = self.initial_states[e]
+        parts = [states[:0]]
+        for name, _, entries in read:
+            if entries:
+                parts.append(self.parameters[mapped.get(name, name)].start + np.array(entries))
+        return np.concatenate([*parts, states[states >= 0]]).astype(np.intp)
 
     @cached_property
     def log_names(self) -> tuple[str, ...]:

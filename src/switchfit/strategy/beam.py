@@ -45,7 +45,7 @@ from switchfit.engine.native.native_hypotheses import NativeHypotheses, OrderTab
 from switchfit.fit.data_variation import assume_noise
 from switchfit.problem.corners.branches import find_corners
 from switchfit.problem.priors import PriorTerms
-from switchfit.problem.problem import Problem, place_parameters
+from switchfit.problem.problem import Problem
 from switchfit.strategy.beam_grid import (
     MOST_GRID_INTERVALS,
     build_mesh,
@@ -57,7 +57,7 @@ from switchfit.strategy.beam_grid import (
     list_sample_times,
 )
 from switchfit.strategy.library import Library
-from switchfit.strategy.library_structure import list_jumps, refuse_unsupported, trace_transitions
+from switchfit.strategy.library_structure import trace_library
 from switchfit.strategy.proposal import Proposal, Quadratic
 from switchfit.strategy.sequences import MOST_PER_SEQUENCE, Children, Integers, Rules, Sequences, select_lowest
 from switchfit.strategy.time_limit import check_time
@@ -175,12 +175,7 @@ class Beam:
 
     def __init__(self, problem: Problem, e: int, library: Library | None = None, grid: float | None = None) -> None:
         run, unknowns = problem.experiments[e], problem.unknowns
-        refuse_unsupported(problem, e)
         self.births = max(len(run.transition_times) if library is None else library.max_switches, 1)
-        structure, self.functions = trace_transitions(problem, e, library, self.births)
-        self.modes = structure.mode_names
-        found = (line for mode in structure.modes for line in find_corners(mode).lines)
-        self.corners = list(dict.fromkeys(filter(None, found)))
         self.limits = limit_times(run.times if library is None else (), self.births)
         self.grid = choose_grid(run) if grid is None else grid
         is_near = np.diff(self.limits)[:, 0] < self.grid
@@ -190,16 +185,22 @@ class Beam:
             marks = np.union1d(marks, seen[:: max(len(seen) // MOST_GRID_INTERVALS, 1)])
         mesh = build_mesh(run, self.grid, marks)
         self.times, self.stops = mesh.times, choose_stops(mesh.times, self.grid, marks)
+        is_unknown = any(item.sigma is None for item in run.measurements)
+        self.counts = count_values(run.measurements, mesh.times) if is_unknown else None
+        structure, self.functions, jumps = trace_library(problem, e, library, self.births, mesh)
+        self.modes = structure.mode_names
+        found = (line for mode in structure.modes for line in find_corners(mode).lines)
+        self.corners = list(dict.fromkeys(filter(None, found)))
         mapped = run.parameter_map
         fixed = [problem.parameters[mapped.get(name, name)].value for name, _, read in structure.parameters if not read]
         arguments = build_arguments(problem, e, mesh)._replace(fixed=tuple(fixed))
-        engine = hypotheses_of(problem, structure, arguments, mesh, list_jumps(run, structure, mesh))
+        engine = hypotheses_of(problem, structure, arguments, mesh, jumps)
         if isinstance(engine, str):
             raise ValueError(f"a beam needs machine code, but {engine}. Use method='insertion'.")
         self.engine: NativeHypotheses = engine
         # p of the traced model: its free parameters, then free initial states. `in_theta` is sorted and without
         # repetitions.
-        in_theta, self.places = np.unique(place_parameters(problem, e, structure), return_inverse=True)
+        in_theta, self.places = np.unique(unknowns.place(e, structure.parameters, mapped), return_inverse=True)
         same, S = self.places[:, None] == self.places, self.births
         self.ties = np.eye(len(same)) - same / same.sum(1)
         self.own = in_theta - int(unknowns.is_time.sum())
@@ -208,8 +209,6 @@ class Beam:
         self.lower, self.upper = unknowns.lowest[in_theta], unknowns.upper[in_theta]
         self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
         self.spread = np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD)
-        is_unknown = any(item.sigma is None for item in run.measurements)
-        self.counts = count_values(run.measurements, mesh.times) if is_unknown else None
         self.noise = assume_noise(problem)  # that of all runs
         guards = (self.noise / (GUARD_SD * self.grid)) ** 2
         self.tolerances = HypothesisTolerances(max(LEAST_BEAM_RTOL, problem.rtol), problem.atol / problem.rtol, guards)

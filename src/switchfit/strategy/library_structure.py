@@ -18,7 +18,7 @@ from switchfit.strategy.library import Library
 from switchfit.strategy.sequences import Integers
 
 
-def refuse_unsupported(problem: Problem, e: int) -> None:
+def _refuse_unsupported(problem: Problem, e: int) -> None:
     """Raise ValueError for an experiment that a beam cannot follow."""
     run = problem.experiments[e]
     name = f"experiment {problem.run_names[e]!r}" if len(problem.experiments) > 1 else "the experiment"
@@ -46,12 +46,21 @@ def trace_transition(problem: Problem, run: Experiment, pair: tuple[str, str]) -
     return found.reset_maps[0], found.transition_costs[0], found.guards[0]
 
 
-def trace_transitions(problem: Problem, e: int, library: Library | None, births: int) -> tuple[Structure, Integers]:
-    """Return the structure of an experiment with the modes and transitions of a library, and the places of the reset
-    map, of the cost and of the guard of each of its transitions: (3, K, K), -1 without one.
+def trace_library(
+    problem: Problem, e: int, library: Library | None, births: int, mesh: Mesh
+) -> tuple[Structure, Integers, list[tuple[int, int]]]:
+    """Return the structure of an experiment with the modes and transitions of a library; the places of the reset map,
+    of the cost and of the guard of each of its transitions: (3, K, K), -1 without one; and for each jump at a known
+    time its node on a mesh and the place of its map.
 
     Without a library, those of the given order of modes, whose N + 1 places stand for the modes.
+
+    Raises
+    ------
+    ValueError
+        For an experiment that a beam cannot follow.
     """
+    _refuse_unsupported(problem, e)
     run = problem.experiments[e]
     sequence = run.mode_sequence
     modes = tuple(m for m in problem.system.modes if m in (sequence if library is None else library.modes))
@@ -60,12 +69,13 @@ def trace_transitions(problem: Problem, e: int, library: Library | None, births:
     else:
         pairs = [pair for pair in product(modes, modes) if pair[0] != pair[1] and library.allows(*pair)]
         steps = [(pair, (modes.index(pair[0]), modes.index(pair[1]))) for pair in pairs]
+    traced = [(place, trace_transition(problem, run, pair)) for pair, place in steps]
     structure = trace_structure(problem._sources, run, births)
     known: list[list[Any]] = [list(dict.fromkeys(structure.reset_maps[i] for i in structure.jumps)), [], []]
     size = max(len(modes), *(1 + max(place) for _, place in steps), 1)
     tables = np.full((3, size, size), -1, dtype=np.int64)
-    for pair, place in steps:
-        for table, functions, function in zip(tables, known, trace_transition(problem, run, pair), strict=True):
+    for place, here in traced:
+        for table, functions, function in zip(tables, known, here, strict=True):
             if function is not None:
                 functions += [] if function in functions else [function]
                 table[place] = functions.index(function)
@@ -79,11 +89,6 @@ def trace_transitions(problem: Problem, e: int, library: Library | None, births:
         guard_library=guards,
         known=0,  # jumps act at nodes, and are no transitions here
     )
-    return structure, tables
-
-
-def list_jumps(run: Experiment, structure: Structure, mesh: Mesh) -> list[tuple[int, int]]:
-    """Return the node of each jump at a known time, and the place of its map in the library."""
     maps = [structure.reset_library.index(structure.reset_maps[i]) for i in structure.jumps]
     nodes = np.searchsorted(mesh.times, run.jump_times).tolist()
-    return list(zip(nodes, maps, strict=True))
+    return structure, tables, list(zip(nodes, maps, strict=True))

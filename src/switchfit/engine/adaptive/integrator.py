@@ -27,7 +27,7 @@ from switchfit.engine.corners.course import BranchError, Course, Crossing
 from switchfit.engine.jax.programs import call_model
 from switchfit.engine.native.native_experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.sizes import Order
-from switchfit.engine.run import Run, take_implicit_steps
+from switchfit.engine.run import Run
 from switchfit.problem.finiteness import find_undefined
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
@@ -99,7 +99,7 @@ class Integrator:
         self._arguments = whole.without_mesh()
         self._native: NativeExperiment | None = None
         # Modes that were found stiff take implicit steps here, which the structure does not say yet: a program apart.
-        chosen = take_implicit_steps(structure, settings.implicit)
+        chosen = structure.take_implicit_steps(settings.implicit)
         if course is None or course.branches.count:
             # A solver is kept for the coarse mesh alone, which lives as long as the run; others would pile up mesh by
             # mesh.

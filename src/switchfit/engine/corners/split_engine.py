@@ -27,10 +27,10 @@ from switchfit.arrays import BoolArray, FloatArray, IntArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive.integrator import SolveSettings
+from switchfit.engine.adaptive.step_times import find_path
 from switchfit.engine.corners.branch_functions import are_equal
 from switchfit.engine.corners.branches import Branches, BranchPath
 from switchfit.engine.corners.course import Course, find_dips
-from switchfit.engine.corners.path_search import find_path
 from switchfit.engine.evaluation import DenseEvaluation, Engine, Evaluation, Matrix, build_undefined_evaluation
 from switchfit.engine.jax.jax_engine import JaxEngine
 from switchfit.engine.native.native_engine import NativeEngine
