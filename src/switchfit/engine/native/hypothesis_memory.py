@@ -41,6 +41,8 @@ def divide_record(sizes: Sizes) -> dict[str, slice]:
     x, Z, g, H : (n,), (n, width), (width,), (D, width)
     """
     n, D, width = sizes.n, sizes.D, sizes.width
+    # The order matters: what a step changes is J to `parts`, then x to H. p and `moved` between them stay, and a cell
+    # that is tried again is restored by two copies; see `copy_changed` in `hypothesis_loops`.
     lengths = dict.fromkeys(("J", "error", "score", CHECKED, "parts"), 1) | {"p": sizes.M, "moved": D}
     lengths |= {"x": n, "Z": n * width, "g": width, "H": D * width}
     ends = accumulate(lengths.values())
@@ -57,6 +59,7 @@ def scratch_sizes(sizes: Sizes) -> dict[str, int]:
     eliminated, and what the straight-line functions exchange.
     """
     n, D, width = sizes.n, sizes.D, sizes.width
+    # One scratch space for all hypotheses, which are propagated one after the other.
     lengths = {"rows": (D + 1) * width, "reduced": D, "K": n + 1}
     lengths |= {"XZ": STAGES * n * width, "entries": STAGES * (1 + n + sizes.M) ** 2}
     return lengths | {"increments": STIFF.coupled * n, "newton": 2}

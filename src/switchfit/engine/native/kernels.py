@@ -2,6 +2,16 @@
 
 The equations are those of `switchfit.discretization.rows`.
 
+Second derivatives need no matrix (n, n) that goes backward. With a step, sample or reset as a map z -> F(z, theta) of
+cost L, the recursions of Omega (12), of Theta (15) and of H (13), (14), (16) in the discretized system,
+
+    Omega  = F_z' Omega+ F_z + psi+ . F_zz + L_zz
+    Theta  = F_z' (Omega+ F_theta + Theta+) + psi+ . F_ztheta + L_ztheta
+    H      = H+ + F_theta' Omega+ F_theta + F_theta' Theta+ + Theta+' F_theta + psi+ . F_thetatheta + L_thetatheta
+
+unroll to the sum over all maps of ``(Z, 1)' (psi+ . D^2 F + D^2 L) (Z, 1)``, with the tangents Z that the forward sweep
+has kept. The backward sweep takes psi alone; what it adds to H is Z' S Z, S being the entries of a stage or a node.
+
 A straight-line function reads and writes through pointers. The name of a pointer means the same in all functions:
 
     c, p            constants, parameters
@@ -190,6 +200,7 @@ class Kernels:
         found = rows.stages(tableau, field, start, end, x, k)
         after = x + (combine(tableau.b, k) if k else h * combine(tableau.b, found.slopes))
         stores, factors = store_all("x_after", 0, after), None
+        # Without a backward step nothing is kept for it.
         keep: Callable[..., list[Store]] = store_all if self.goes_back else lambda *_: []
         if self.order > Order.COST:
             at_points = found.states
@@ -361,6 +372,7 @@ class Kernels:
             points = zip(times, states, known, strict=True)
             ell_x = [stage(graph, *at(t, X), only=(ELL_X,), known=kept_there)[0] for t, X, kept_there in points]
             factors = factors.load(graph)
+        # psi, w_j and mu_j of `discretization.rows`: (7) of the paper for the discretized system.
         found = rows.adjoint(tableau, h, psi, pull, ell_x, factors)
         # A late sample ends a row of its own, which starts where the row around it does: `late` is its costate there.
         before = found.before + graph.loads("late", n) if self.has_late else found.before
@@ -391,6 +403,7 @@ class Kernels:
                 factor_d = rows.length_factor(tableau, psi, found.states, K_d, ell_d)
                 stores.append(("length", 0, as_vector(graph, factor_d)))
         stores.append(("g", 0, as_vector(graph, g)))
+        # S_j goes to memory, not to H: Z' S Z is long, and rows of all modes share the functions that add it.
         chosen, entries = self._store_entries(graph, tableau, second)
         self.module.write_straight_line(name, stores + entries + graph.check())
         return chosen
@@ -454,6 +467,7 @@ class Kernels:
     def nodes(self) -> None:
         """Write the functions of all nodes."""
         library = self.library
+        # x(t0) of p is a reset map without a state before it.
         maps = {"start": self.templates.start()}
         maps |= {f"reset_{which}": self.templates.reset(which) for which in range(len(library.reset_maps))}
         for name, template in maps.items():

@@ -99,11 +99,18 @@ def layout_of(library: Structure, sizes: Sizes, order: Order) -> MemoryLayout:
     resets, jumps = int(bool(library.reset_maps)), int(has_jumps(library))
     implicit = int(any(library.implicit))
     late = int(any(sensor.delay is not None for sensor in library.measurements))
+    # A row keeps what its backward step reads: the states of its stages, with the slopes of an implicit row behind
+    # them; their tangents; functions of the C library and factors.
     of_row = {"X": STAGES * n, "XZ": STAGES * n * width, "kept": count_kept(library, n, order)}
+    # psi is among the sums since it starts at zero: nothing follows tf. The backward sweep leaves psi(t0) in it.
     sums = {"psi": n, "J": 1, "g": width, "H": sizes.D * width}
     sums |= {"constraints": count, "jacobian": count * width, "errors": n, CHECKED: 1}
+    # State r is the one before row r, so that there is one more state than rows; late samples have their own row, and
+    # a state at its end, behind them all. A part that this order does not need has no room for each row:
+    # `Writer.at_row` then gives the same address for all rows.
     memory = {
         "x": (n + n * late, n),
+        # Apart from the states of rows: simulations show x(tau-) and x(tau+), and derivatives need both.
         "reset_x": (N * n * resets, 0),
         "Z": (n * width * (1 + late), n * width * derivatives),
         "reset_Z": (N * n * width * resets, 0),
@@ -113,6 +120,7 @@ def layout_of(library: Structure, sizes: Sizes, order: Order) -> MemoryLayout:
         "costate": (0, n * derivatives),
         "increments": (len(STIFF.b) * n * implicit, 0),
         "newton": (2 * implicit, 0),
+        # Of one row at a time: its backward step writes them, and the functions of curvature behind it read them.
         "entries": (STAGES * (1 + n + sizes.M) ** 2, 0),
         "length": (width, 0),
     }

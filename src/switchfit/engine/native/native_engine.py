@@ -51,6 +51,7 @@ class NativeEngine:
     def at(self, order: Order) -> NativeExperiment | None:
         """Return the experiment with derivatives of an order; None if that order alone has no machine code."""
         if order not in self._experiments:
+            # Made on demand: a fit that never asks for J alone does not lay out the memory for it.
             made = native_experiment(self._structure, self._arguments, self._mesh.times, order)
             if made is not None and self._judges_rows:
                 made.judge_rows(jumps=self._mesh.is_sharp)
@@ -65,6 +66,7 @@ class NativeEngine:
 
     def _try(self, order: Order, use: Callable[..., Found], fall_back: Callable[..., Found], *given: Any) -> Found:
         """Return what one function finds in machine code of an order, or what another finds by JAX."""
+        # JAX computes 0 * inf as NaN, where machine code has left the product out: its result is the right one.
         native = self.at(order)
         try:
             return fall_back(*given) if native is None else use(native, *given)
@@ -121,6 +123,8 @@ class NativeEngine:
             before_d, after_d, opening = found.tangents.before, found.tangents.after, found.first_row[1:]
             moving, modes = np.setdiff1d(np.arange(structure.N), structure.jumps), np.array(structure.mode_of_segment)
             beside = (after_d, found.after, opening - 1, modes[:-1]), (before_d, found.before, opening, modes[1:])
+            # x(tau-) ends the row before a transition, in the mode before it; x(tau+) begins the row behind it, in the
+            # next mode.
             for derivative, states, rows, own in beside:
                 slopes = self.slopes(tau, found.first_cell[1:], states[rows], p)
                 derivative[rows[moving], :, moving] -= slopes[moving, own[moving]]

@@ -90,6 +90,7 @@ class NativeExperiment:
             arrays = {name: a for name, a in given.items() if a.dtype.kind == np.dtype(kind).kind}
             block = np.concatenate(list(arrays.values()), axis=None, dtype=kind)
             self._divide(block, {name: a.size for name, a in arrays.items()})
+        # One block, which the driver clears by one call.
         self._divide(np.zeros(sum(layout.sums.values())), layout.sums)
         self._pointers = layout.names
         self._memory = np.zeros(0)  # the scratch space that the table points to, after the first call
@@ -154,6 +155,7 @@ class NativeExperiment:
 
     def find_constraints(self, tau: FloatArray, p: FloatArray, side: float) -> DenseEvaluation:
         """Return J and the constraints with their derivatives; those of J are of no meaning."""
+        # -2: the driver leaves the backward sweep out; see `loops.driver`.
         self._named["modes"][-1] = -2
         try:
             return self(tau, p, side, np.zeros(len(self._constraint_rows)))
@@ -219,6 +221,7 @@ class NativeExperiment:
                 ends, resets = of_rows(name, cells + N + 1, *shape), list(self.structure.resets)
                 starts = ends[:-1].copy()
                 if resets:
+                    # Row first_cell + segment begins with transition `segment`: its start is what the reset map left.
                     after = of_rows(f"reset_{name}", N, *shape)
                     starts[(first_cell[1:] + np.arange(1, N + 1))[resets]] = after[resets]
                 return starts, ends[1:]
@@ -296,6 +299,8 @@ class NativeExperiment:
         """
         self._own_p[:] = p
         rows, count = np.empty((most, 1 + len(y))), np.zeros(1, dtype=np.int64)
+        # The steps add to the check, and nothing else clears it: `evaluate` clears the sums, a single function does
+        # not.
         self._check[0] = 0.0
         given = self._address, self._cells, *map(get_address, (state, y, rows)), most, get_address(count)
         self._find(f"adaptive_{mode}_steps", len(given))(*given)

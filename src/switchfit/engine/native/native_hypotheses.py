@@ -77,6 +77,8 @@ class NativeHypotheses:
         self._cells, self.record_size = len(times) - 1, measure_record(sizes)
         self._shape = sizes.n, sizes.D, sizes.width
         nodes = np.arange(self._cells + 2)
+        # The table of pointers has no names: the order here is that of `HypothesisWriter.names`, that is
+        # `HYPOTHESIS_POINTERS`, the scratch space, then the samples of each Measurements.
         self._arrays: dict[str, Any] = {
             "nodes": np.array(times),
             "signals": np.ascontiguousarray(np.asarray(arguments.signals)[: self._cells]),
@@ -90,6 +92,7 @@ class NativeHypotheses:
         }
         for k, samples in enumerate(arguments.samples):
             count = count_samples(samples)
+            # A sample lies at the end of its cell, which is node cell + 1.
             first = np.searchsorted(np.asarray(samples.cell)[:count] + 1, nodes).astype(np.int64)
             values = (np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in samples[1:])
             self._set_samples(k, first, *values)
@@ -116,6 +119,7 @@ class NativeHypotheses:
         self._cells = cells + 1  # no node is the end
         wide = self._arrays["signals"].shape[1:]
         given: dict[str, Any] = {"nodes": np.zeros(cells + 1), "signals": np.zeros((cells, *wide))}
+        # Names that are there keep their place in the order, and so in the table.
         self._arrays |= given | {"jump_first": np.zeros(cells + 2, dtype=np.int64)}
         of_sensors = []
         for k in range(sum(name.startswith("first ") for name in self._arrays)):
@@ -156,6 +160,8 @@ class NativeHypotheses:
         """
         parent, before, after, slot = children.T[: Column.SLOT + 1]
         times = np.full((len(children), 1), self._arrays["nodes"][first])
+        # One birth, or none: (number, first mode, parent), as `propagate` reads them. A child without a birth begins
+        # in its own mode.
         counts = np.stack([slot >= 0, np.where(slot >= 0, before, after), parent], axis=1)
         return self._go_on(parents.records, (children, times, counts), (first, last, False))
 
@@ -180,6 +186,7 @@ class NativeHypotheses:
         K, room = len(order.counts[0]), PER_PLACE + 1
         records, wide = np.empty((2, K * room, self.record_size)), np.empty((2, K * room, births.shape[1]))
         numbers, ranks = np.zeros((2, K), dtype=np.int64), np.arange(2 * K * room).reshape(2, K * room)
+        # The k-th hypothesis in a place goes to the k-th of its records; the last of each place is spare.
         rank = [places[:k].tolist().count(place) for k, place in enumerate(places.tolist())]
         at = places * room + np.array(rank, dtype=np.int64)
         records[0, at], wide[0, at], numbers[0] = parents, births, np.bincount(places, minlength=K)
@@ -187,6 +194,7 @@ class NativeHypotheses:
         sizes = K, births.shape[1], first, last, self._cells
         count_work(CALL + (last - first) * K * PER_PLACE * self._cell_work)
         self._follow_order(self._table_at, *map(get_address, given), *sizes)
+        # Generations alternate: after an even number of stops the result is in the first.
         end = (last - first) % 2
         kept = np.arange(room) < numbers[end, :, None]
         found = ranks[end].reshape(K, room)[kept] - end * K * room
@@ -221,6 +229,7 @@ class NativeHypotheses:
             False leaves the point of linearisation where it is at the end.
         """
         at, own = self._at, self.view(np.zeros((len(counts), self.record_size)))
+        # One step in the first cell; an error of 1 asks for no longer ones.
         own.costs[:], own.records[:, at["parts"]], own.records[:, at["error"]] = start.costs, 1.0, 1.0
         own.records[:, at["p"]], own.moved[:] = p, start.moved
         own.gradients[:], own.matrices[:] = start.gradients, start.matrices

@@ -61,11 +61,14 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     writer = Writer(library, sizes, order, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
     curvatures = []
+    # A part for each mode: these are the longest. A mode whose text is the same in another library is loaded from the
+    # cache.
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
         if order > Order.COST:
             module.row_work.append(estimate_row(writer, mode, curvatures[mode]["inner"]))
         yield module.take()
+    # Before the loops that call them: a call needs the pointers of its function.
     kernels.nodes()
     for k in range(len(library.measurements)):
         if k in late:
@@ -73,6 +76,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
             module.add(write_late_samples(writer, k, curvatures))
         else:
             module.add(write_samples(writer, k))
+    # Single calls from Python, for the adaptive solver, which has no derivatives.
     for name in ["start", *(f"reset_{k}" for k in range(len(library.reset_maps)))] if order == Order.COST else ():
         module.add(write_loop(writer, name))
     kernels.state()
@@ -83,6 +87,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     module.add(write_evaluation(writer))
     if order > Order.COST:
         module.add(write_backward(writer, curvatures))
+    # Fits inside a program of JAX take steps by the exact Hessian alone.
     if order == Order.HESSIAN:
         module.add(write_handler(writer))
     yield module.take()
@@ -93,6 +98,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
     module, order, library = kernels.module, kernels.order, kernels.library
     running = bool(library.running or library.references) and not library.is_rest(mode)
     stage = kernels.templates.stage(mode, running=running)
+    # A row beside a transition has ends that move with theta, and more code; all others share `inner`.
     kinds = [("inner", stage, False, running, False), ("end", stage, True, running, False)]
     if late:
         # A late sample's row is beside the trajectory: it adds no running cost, which the row around it has.

@@ -44,18 +44,23 @@ def compile_library(library: Structure, sizes: Sizes, orders: tuple[Order, ...],
         return _program_of(library, sizes, orders, write)
 
 
+# The key is all that the code depends on: the library, whose functions are compared by content, the sizes, the orders,
+# and who writes it. Mode sequences, data and meshes are arguments of the machine code.
 @lru_cache(maxsize=64)
 def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write) -> Program | str:
     modules = {order: Module(sizes.width, ORDER_PREFIXES[order]) for order in orders}
     try:
+        # A vector without entries is no type of LLVM.
         if sizes.D == 0:
             raise Unsupported("an experiment has no unknowns")
         with use_float64():
+            # A generator: one part is compiled while the next one is traced.
             parts = (write(library, sizes, order, each) for order, each in modules.items())
             program = compile_modules(chain.from_iterable(parts))
     except Unsupported as error:
         reason = str(error)
         log.info("No machine code: %s.", reason)
+    # Whatever went wrong, JAX can evaluate the problem; tests look for reasons that begin with `internal: `.
     except Exception as error:
         reason = f"internal: {type(error).__name__}: {error}"
         log.info("No machine code: %s.", reason, exc_info=True)

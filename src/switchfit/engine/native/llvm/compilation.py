@@ -59,6 +59,8 @@ class Program:
     def function(self, name: str, count: int) -> Callable[..., None]:
         """Return a Python callable for a void function of so many integers and addresses."""
         if name not in self._functions:
+            # All parameters are 64-bit integers, addresses too. ctypes releases the GIL during a call, so that others
+            # may run; whoever shares `memory` holds `lock`.
             kind = ctypes.CFUNCTYPE(None, *[ctypes.c_int64] * count)
             self._functions[name] = kind(self._engine.get_function_address(name))
         return self._functions[name]
@@ -99,6 +101,8 @@ def compile_modules(texts: Iterable[str]) -> Program:
 
 def _create_machine() -> llvm.TargetMachine:
     name, features = _get_processor()
+    # opt=2 is that of the code generator. No pass over the text runs before it: zeros and repetitions are gone
+    # already.
     return llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
 
 
@@ -126,6 +130,7 @@ def _get_processor() -> tuple[str, str]:
 def _initialize_llvm() -> None:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
+    # LLVM makes one call of sincos of a sine and a cosine of the same number.
     libm = ctypes.CDLL("ucrtbase" if sys.platform == "win32" else ctypes.util.find_library("m"))
     for name in (*FROM_LIBM, "sincos"):
         if hasattr(libm, name):

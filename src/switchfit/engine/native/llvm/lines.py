@@ -98,6 +98,7 @@ class Lines:
 
     def begin(self, signature: str) -> list[Value]:
         """Begin a function, such as ``void @name(i64 %count)``; return its parameters."""
+        # `internal void @name(ptr %A, i64 %m)` yields a value for %A and one for %m.
         self._signature, given = signature, signature[signature.index("(") + 1 : -1].split(", ")
         return [Value(self, *each.split()) for each in given if each]
 
@@ -126,6 +127,7 @@ class Lines:
 
     @property
     def _has_ended(self) -> bool:
+        # LLVM refuses instructions behind a jump or a return, the last ones of their block.
         return bool(self.lines) and self.lines[-1].startswith(("  br ", "  ret ", "  switch "))
 
     def let(self, kind: str, text: str) -> Value:
@@ -138,11 +140,14 @@ class Lines:
         """Return an operand of a type as text."""
         if isinstance(operand, Value):
             return operand.name
+        # Decimal numbers would be rounded on the way; truth values are `true` and `false`.
         return literal(operand) if kind == "double" else str(operand).lower()
 
     def allocate(self, kind: str, count: int = 1) -> Value:
         """Emit memory of the function for so many values."""
         name = f"%memory{len(self._allocated)}"
+        # It goes to the start of the function, wherever it is asked for: in the body of a loop, an alloca would take
+        # new memory of the stack in each iteration.
         self._allocated.append(f"  {name} = alloca [{count} x {kind}], align 8")
         return Value(self, "ptr", name)
 
@@ -172,6 +177,7 @@ class Lines:
 
     def spread(self, value: Operand, width: int) -> Value:
         """Emit the vector with this value in all entries."""
+        # LLVM's idiom of a broadcast: into entry 0 of an undefined vector, then entry 0 to all.
         kind, zeros = f"<{width} x double>", f"<{width} x i32> zeroinitializer"
         one = self.let(kind, f"insertelement {kind} poison, double {value}, i64 0")
         return self.let(kind, f"shufflevector {kind} {one}, {kind} poison, {zeros}")
@@ -189,6 +195,9 @@ class Lines:
     @contextmanager
     def loop(self, start: Operand, stop: Operand, step: int = 1) -> Iterator[Value]:
         """Emit a loop whose body is what is emitted inside; the value is its counter."""
+        # The counter is a phi: it has one value if the loop is entered from the block before, another at the end of an
+        # iteration. The body may end in another block than the one it begins in, so that the counter increases in a
+        # block of its own, `_end`, whose name is known in advance.
         name, before = self.name_block(), self._block
         k = Value(self, "i64", f"%{name}_k")
         self.label(name)
@@ -204,6 +213,7 @@ class Lines:
     @contextmanager
     def repeat(self) -> Iterator[Callable[[Value], None]]:
         """Emit an endless loop; the value is a function that emits its end where a condition holds."""
+        # The caller may leave at several places of the body, each of which begins a new block.
         name = self.name_block()
 
         def leave(condition: Value) -> None:

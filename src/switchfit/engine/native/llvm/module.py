@@ -56,8 +56,10 @@ class Module:
         """
         writer = _Writer(self)
         nodes = list_needed([node for _, _, node in stores])
+        # Everything is computed before the first store: `x_after` may be `x`, and sums are read and written.
         for node in nodes:
             writer.value(node)
+        # A vector counts as its parts of 4 doubles, which one register of AVX2 holds.
         self.work[name] = sum(_estimate_cost(node) * (1 + self.width // 4 if node.vector else 1) for node in nodes)
         for pointer, offset, node in stores:
             writer.used.add(pointer)
@@ -68,6 +70,7 @@ class Module:
 
     def add(self, text: str) -> None:
         """Add a hand-written function; all function names in it, except LLVM's intrinsics, get the prefix."""
+        # Orders of derivatives share a program: the prefix keeps `evaluate` of one apart from that of another.
         self._functions.append(re.sub(r"@(?!llvm\.)(\w+)\(", rf"@{self.prefix}\1(", text))
 
     def declare(self, name: str, signature: str) -> None:
@@ -182,6 +185,7 @@ class _Writer(Lines):
 
     def _table(self, values: NDArray[np.float64]) -> Value:
         """Declare a constant array, which the functions of a module share; return its name."""
+        # Named by content: equal tables of a module are one, and its text stays the same in every process.
         name = f"table.{hashlib.sha256(values.tobytes()).hexdigest()[:16]}"
         entries = ", ".join(f"double {literal(value)}" for value in values.tolist())
         kind = f"[{len(values)} x double]"

@@ -1,8 +1,13 @@
 """Loops over the rows of a segment, forward and backward.
 
-Rows are numbered by ``cell + segment``: each transition cuts one cell in two. The mode of a segment, and the reset map
-and other functions of a transition, are read at run time, so that all sequences of a library share a program. Segments
-that a sequence does not need are idle: they begin and end at tf.
+Rows are numbered by ``cell + segment``: each transition cuts one cell in two. Row r leads from state r to state r + 1:
+
+    cells      |     0     |     1     |     2     |       nodes t_0 .. t_3, one transition tau in cell 1
+    rows       |     0     |  1  |  2  |     3     |       segment 0: rows 0 and 1, segment 1: rows 2 and 3
+    states     0           1    2           3     4       `x`, `Z`; x(tau+) is in `reset_x` if there is a reset map
+
+The mode of a segment, and the reset map and other functions of a transition, are read at run time, so that all
+sequences of a library share a program. Segments that a sequence does not need are idle: they begin and end at tf.
 """
 
 from __future__ import annotations
@@ -89,9 +94,11 @@ def write_newton(writer: Writer, name: str) -> str:
     given = dict(zip(names, parameters, strict=True))
     # k = 0 is X_j = x, so that the first iteration is a linearly implicit step.
     writer.zero(given["increments"], count)
+    # 1: the iteration before the first was not small; two in a row count as converged.
     writer.store(1.0, given["newton"])
     with writer.loop(0, NATIVE_NEWTON_ITERATIONS):
         writer.call(name, given)
+        # Returns as soon as it has converged; what follows the loop is the case that it has not.
         with writer.when(writer.get("double", given["newton"], 1).differs(0.0)):
             writer.line("ret void")
     for pointer in (given["J"], *(writer.at(given["increments"], k) for k in range(count))):
@@ -146,6 +153,7 @@ def write_forward(writer: Writer) -> str:
     # Behind the modes: 0 or less if nothing is judged, 1 for the errors of rows, 2 for jumps inside them too.
     flag = writer.get("i64", found["modes"], writer.sizes.N + 1)
     mode, modes = writer.get("i64", found["modes"], segment), len(writer.library.modes)
+    # Inclusive at both ends: the cell that a transition cuts is the last of one segment and the first of the next.
     with writer.loop(first, last + 1) as cell:
         given, case = row_pointers(writer, found, segment, cell, last)
         # The first row begins behind the reset map, whose state is not among those of the rows.
@@ -195,6 +203,7 @@ def write_backward(writer: Writer, curvatures: Sequence[dict[str, CurvatureFunct
     _, segment = writer.begin("void @backward(ptr %table, i64 %segment)")
     found = writer.pointers()
     first, last = (writer.get("i64", found["first_cell"], k) for k in (segment, segment + 1))
+    # Last row first. `psi` is one vector, which each row replaces by that at its start.
     with writer.loop(0, last - first + 1) as turn:
         given, case = row_pointers(writer, found, segment, last - turn, last)
         for k, kind in row_cases(writer, case):

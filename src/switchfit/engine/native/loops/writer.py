@@ -33,10 +33,12 @@ class Writer(Lines):
 
     def pointers(self) -> Pointers:
         """Load all pointers of the table."""
+        # All of them, whatever the function uses: LLVM drops the loads that nothing reads.
         return {name: self.get("ptr", "%table", k) for k, name in enumerate(self.names)}
 
     def at_row(self, found: Pointers, row: Operand, *names: str, suffix: str = "") -> Pointers:
         """Emit the addresses of parts of the scratch space at a row, as names with a suffix."""
+        # The step is 0 for a part that has no room for each row: the same address for all of them.
         return {f"{name}{suffix}": self.at(found[name], row, self.layout.memory[name][1]) for name in names}
 
     def at_sample(self, found: Pointers, k: int, sample: Value) -> Pointers:
@@ -50,6 +52,7 @@ class Writer(Lines):
 
     def call(self, name: str, given: Pointers) -> None:
         """Emit the call of a straight-line function with its pointers."""
+        # `write_straight_line` sorts its pointers by name: so does every call of it.
         self.invoke(name, *(given[key] for key in self.module.pointers[name]))
 
     def take_step(self, mode: int, name: str, given: Pointers, newton: str = "newton") -> None:
@@ -64,6 +67,7 @@ class Writer(Lines):
         """Emit a switch to one of `count` blocks, each of which is what is emitted in an iteration; -1 skips them."""
         name = self.name_block()
         cases = " ".join(f"i64 {k}, label %{name}_{k}" for k in range(count))
+        # A switch jumps to the end by default: -1, for no function at all, is none of the cases.
         self.line(f"switch i64 {which}, label %{name}_end [{cases}]")
         for k in range(count):
             self.label(f"{name}_{k}")
@@ -96,6 +100,7 @@ def write_loop(writer: Writer, name: str) -> str:
     pointers = "".join(f", ptr %{key}, i64 %{key}_step" for key in keys)
     count, *given = writer.begin(f"void @each_{name}(i64 %count{pointers})")
     with writer.loop(0, count) as k:
+        # A step of 0 bytes keeps a pointer where it is: p and the constants are the same at all points.
         each = zip(keys, given[::2], given[1::2], strict=True)
         writer.call(name, {key: writer.into(pointer, k * step) for key, pointer, step in each})
     return writer.end()

@@ -43,6 +43,7 @@ def write_handler(writer: Writer) -> str:
 
     found = {name: of_buffer(arguments, k, BUFFER_DATA) for k, name in enumerate(names)}
     totals, between = (of_buffer(results, k, BUFFER_DATA) for k in (0, 1))
+    # All sums are one result, in the order of the layout: the first is `totals`, the second the scratch space.
     position = 0
     for name, length in writer.layout.sums.items():
         found[name] = writer.at(totals, position)
@@ -54,6 +55,7 @@ def write_handler(writer: Writer) -> str:
         place = rows * each_row + fixed + place
     for k, name in enumerate(writer.names):
         writer.put(found[name], table, k)
+    # The number of samples of each Measurements is the length of its array of cells.
     of_cells = (k for k, name in enumerate(names) if name.startswith("cell "))
     writer.invoke(
         "evaluate", table, *(writer.get("i64", of_buffer(arguments, k, BUFFER_DIMENSIONS), 0) for k in of_cells)

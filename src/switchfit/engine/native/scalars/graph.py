@@ -118,6 +118,7 @@ class Graph:
         """Return the node of a number or a truth value."""
         if isinstance(number, np.ndarray):
             number = number.item()
+        # 1, 1.0 and True are the same key of a dictionary, and so are 0.0 and -0.0: type and sign tell them apart.
         number = bool(number) if isinstance(number, bool | np.bool_) else float(number)
         return self._node("const", (number,), False, key=("const", type(number), number, math.copysign(1.0, number)))
 
@@ -253,6 +254,8 @@ class Graph:
         return None
 
     def _node(self, op: str, args: tuple[Any, ...], vector: bool, key: tuple[Any, ...] | None = None) -> Node:
+        # Arguments by their index: a node is its place in the graph. Equal keys are equal values, so that common
+        # subexpressions of f, its Jacobians and its second derivatives are computed once.
         key = key or (op, vector, *((a.index if isinstance(a, Node) else a) for a in args))
         node = self._known.get(key)
         if node is None:

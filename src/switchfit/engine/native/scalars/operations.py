@@ -95,11 +95,13 @@ def _round_half_away(a: FloatArray) -> FloatArray:
 OPERATIONS = {
     operation.name: operation
     for operation in (
+        # `contract` lets LLVM fuse a product and a sum, which rounds once, not twice; it may not reorder sums.
         _arithmetic("add", np.add, "fadd contract", primitives=("add", "add_any"), commutes=True, known_alike=True),
         _arithmetic("sub", np.subtract, "fsub contract", known_alike=True),
         _arithmetic("mul", np.multiply, "fmul contract", commutes=True, known_alike=True),
         _arithmetic("div", np.divide, "fdiv", effort=4, may_fail=True),
         Operation("neg", np.negative, "fneg {type} {0}", 1, primitives=("neg",)),
+        # Ordered comparisons are false for NaN; `une`, unordered, is true for it, as in Python.
         _comparison("lt", np.less, "olt"),
         _comparison("le", np.less_equal, "ole"),
         _comparison("gt", np.greater, "ogt"),

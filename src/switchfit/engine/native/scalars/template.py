@@ -46,6 +46,8 @@ class Template:
         """
         chosen = tuple(range(len(self._flat)) if only is None else only)
         given = [np.asarray(a, dtype=object).reshape(-1) for a in inputs]
+        # Nodes of the template in their order, each applied anew in the other graph: with known inputs it simplifies
+        # further, and what both have in common is one node there.
         made: dict[int, Node] = dict(known or {})  # the copies by the index of the node here
         for node in self._list_needed(chosen, checked):
             if node.index in made:

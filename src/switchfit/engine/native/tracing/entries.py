@@ -71,6 +71,7 @@ def choose(graph: Graph, condition: Entry, yes: Entry, no: Entry) -> Entry:
     known = known_number(condition)
     if known is not None:
         return yes if known else no
+    # Two known integers become one that is not known, but has bounds: an index by it needs no check of its range.
     if isinstance(yes, Integer) or isinstance(no, Integer) or (_is_known_integer(yes) and _is_known_integer(no)):
         one, other = Integer.of(graph, yes), Integer.of(graph, no)
         node = graph.apply("select", condition, one.node, other.node)
@@ -80,6 +81,7 @@ def choose(graph: Graph, condition: Entry, yes: Entry, no: Entry) -> Entry:
 
 def less(graph: Graph, a: Entry, b: Entry) -> Entry:
     """Return whether a < b for integers: a bool if their bounds decide it."""
+    # By the bounds alone where they suffice: the comparison is then a number, and whatever it selects is known.
     one, other = Integer.of(graph, a), Integer.of(graph, b)
     if one.high < other.low:
         return True
@@ -102,6 +104,7 @@ def clamp(graph: Graph, index: Entry, low: int, high: int) -> Entry:
     """Clamp an integer to a range; return an int if the result is known."""
     if not isinstance(index, Integer):
         return min(max(int(index), low), high)
+    # Bounds inside the range make both selections vanish.
     found = choose_extreme(graph, min, high, choose_extreme(graph, max, low, index))
     return found.low if found.low == found.high else found
 
@@ -120,6 +123,7 @@ def pick(graph: Graph, entries: Sequence[Entry], index: Integer) -> Entry:
     count = len(starts)
     check_size(count, MOST_CHOICES, f"takes one of {count} numbers by an index that depends on the state")
 
+    # A binary tree over the runs of equal entries: each passes log2 of their number in selections.
     def select_run(runs: list[int]) -> Entry:
         if len(runs) == 1:
             return entries[runs[0]]
@@ -140,6 +144,7 @@ def known_number(entry: Entry) -> float | None:
 def _is_same(one: Entry, other: Entry) -> bool:
     if isinstance(one, Integer) and isinstance(other, Integer):
         return one.node is other.node
+    # 0.0 and -0.0 differ, as 1 / x shows; a NaN is the same as any other.
     a, b = known_number(one), known_number(other)
     if a is None or b is None:
         return one is other
@@ -148,6 +153,7 @@ def _is_same(one: Entry, other: Entry) -> bool:
 
 def _look_up(graph: Graph, entries: Sequence[Entry], index: Integer) -> Entry:
     check_size(len(entries), MOST_ROWS_OF_TABLE, f"looks up numbers in a table of {len(entries)} entries")
+    # The table begins with the entry of `index.low`.
     node = graph.lookup(np.array(entries, dtype=float), index.node - float(index.low))
     if all(isinstance(e, bool | np.bool_) for e in entries):
         return graph.apply("ne", node, 0.0)

@@ -44,8 +44,10 @@ def take(graph: Graph, a: TracedArray, starts: Sequence[Index], sizes: Sequence[
     # What the window may reach along each axis.
     ends = [(s.low, s.high) if isinstance(s, Integer) else (s, s) for s in starts]
     a = a[tuple(slice(low, high + size) for (low, high), size in zip(ends, sizes, strict=True))]
+    # Known numbers along several moving axes: one table for all, else each axis multiplies the selections.
     if len(moving) > 1 and all(known_number(e) is not None for e in a.reshape(-1)):
         return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
+    # Axis by axis, each entry of the window is picked among those that it may be for any value of the start.
     for axis in moving:
         rows = np.moveaxis(a, axis, 0)
         window = np.empty((sizes[axis], *rows.shape[1:]), dtype=object)
@@ -62,6 +64,7 @@ def _from_table(
     """Take a window of a known array that moves along several axes: each entry by one index into a table."""
     multiply, add, subtract = (partial(OF_INTEGERS[op], graph, {}, np.dtype(int)) for op in ("mul", "add", "sub"))
     spans = [start.high - start.low + 1 for start in starts]
+    # The index of the table is that of row-major order over the ranges of the starts.
     index: Entry = 0
     for start, span in zip(starts, spans, strict=True):
         index = add(multiply(index, span), subtract(start, start.low))
@@ -82,6 +85,8 @@ def put(
     ranges = [range(s.low, s.high + 1) if isinstance(s, Integer) else (s,) for s in starts]
     count = int(np.prod([len(r) for r in ranges]))
     check_size(count, MOST_CHOICES, f"changes one of {count} numbers at an index that depends on the state")
+    # Every place that the window may have is written, under the condition that it is there: elsewhere the old entry
+    # stays. A place that bounds exclude emits nothing.
     for first in product(*ranges):
         here = condition
         for start, value in zip(starts, first, strict=True):
@@ -142,6 +147,8 @@ def _list_windows(
         starts: list[Any] = [place[batched[axis]] if axis in batched else 0 for axis in range(len(shape))]
         for axis, start in zip(axes, indices[place], strict=True):
             starts[axis] = start
+        # JAX clips an index that is out of range, or fills with a value and drops updates there; which of these is up
+        # to the caller, who has both: the start moved inside, and whether it was inside before.
         fits: Scalar = True
         for axis, (start, n, size) in enumerate(zip(starts, shape, sizes, strict=True)):
             for outside_range in (less(graph, start, 0), less(graph, n - size, start)):
@@ -161,6 +168,7 @@ def gather(graph: Graph, equation: Equation, a: TracedArray, indices: TracedArra
     result = np.empty(out.shape, dtype=object)
     windows = _list_windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape))
     for starts, fits, among in windows:
+        # The window is taken at a place that is inside in any case: no memory outside is read.
         taken = np.squeeze(take(graph, a, starts, sizes), axis=dropped)
         if params["mode"] == GatherScatterMode.FILL_OR_DROP and known_number(fits) is not True:
             fill = _fill_value(params["fill_value"], out.dtype)

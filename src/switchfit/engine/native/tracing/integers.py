@@ -45,6 +45,8 @@ def within(graph: Graph, found: Integer, dtype: np.dtype[Any]) -> Entry:
     least, most = _bounds(dtype)
     if found.high < least or found.low > most:
         raise Unsupported(f"does arithmetic with integers beyond {most}")
+    # First clamped, then required: an evaluation that `require` refuses runs to its end, and must not read outside of
+    # a table on its way.
     inside = clamp(graph, found, least, most)
     if found.low < least or found.high > most:
         graph.require(graph.apply("eq", found.node, Integer.of(graph, inside).node))
@@ -56,6 +58,7 @@ def _exactly(op: str, value: Callable[..., int]) -> Meaning:
 
     def apply(graph: Graph, params: Parameters, dtype: np.dtype[Any], *given: Entry) -> Entry:
         args = [Integer.of(graph, a) for a in given]
+        # Sums, products and sizes are monotonic between the bounds and zero: their extremes are among these corners.
         corners = [value(*c) for c in product(*((a.low, a.high, min(max(0, a.low), a.high)) for a in args))]
         low, high = min(corners), max(corners)
         node = _drop_sign_of_zero(graph, graph.apply(op, *(a.node for a in args)), low, high, op)
@@ -67,6 +70,7 @@ def _exactly(op: str, value: Callable[..., int]) -> Meaning:
 def _drop_sign_of_zero(graph: Graph, node: Node, low: int, high: int, op: str) -> Node:
     if op not in ("mul", "neg", "trunc") or low > 0 or high < 0 or node.op == "const":
         return node if node.number != 0.0 else graph.constant(0.0)
+    # An integer has no -0.0, but -1 times 0.0 is one as doubles.
     return graph.apply("select", graph.apply("eq", node, 0.0), 0.0, node)
 
 
@@ -82,6 +86,7 @@ def _divide(graph: Graph, params: Parameters, dtype: np.dtype[Any], one: Entry, 
 def _find_remainder(graph: Graph, params: Parameters, dtype: np.dtype[Any], one: Entry, other: Entry) -> Entry:
     """Return the remainder with the sign of the dividend; for a division by zero, it is the dividend itself."""
     a, b = Integer.of(graph, one), Integer.of(graph, other)
+    # 1 in place of a divisor of zero, so that no NaN arises in what is not chosen.
     nonzero = Integer.of(graph, choose(graph, equal(graph, b, 0), 1, b))
     largest = max(abs(b.low), abs(b.high)) - 1
     node = a.node - nonzero.node * graph.apply("trunc", a.node / nonzero.node)
@@ -92,6 +97,7 @@ def _find_remainder(graph: Graph, params: Parameters, dtype: np.dtype[Any], one:
 def from_double(graph: Graph, kind: np.dtype[Any], a: Scalar) -> Entry:
     """Return a double as an integer of a type: rounded towards zero, NaN to 0, clipped to the bounds."""
     (least, most), rounded = _bounds(kind), graph.apply("trunc", a)
+    # NaN fails the comparison and becomes 0, as does -0.0.
     number = graph.apply("select", graph.apply("lt", 0.0, graph.apply("abs", rounded)), rounded, 0.0)
     if kind.itemsize == 8:
         graph.require(graph.apply("le", graph.apply("abs", number), float(most)))

@@ -78,6 +78,7 @@ def _exchange_rows(graph: Graph, a: Objects, k: int, other: Index) -> Objects:
         return result
     for i in range(k + 1, len(a)):
         result[i] = [choose(graph, equal(graph, other, i), up, down) for up, down in zip(a[k], a[i], strict=True)]
+    # Row k becomes that of the pivot; the bounds of its index say among which rows it is.
     result[k] = [pick(graph, column.tolist(), other) for column in a[other.low : other.high + 1].T]
     return result
 

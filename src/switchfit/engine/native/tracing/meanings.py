@@ -22,6 +22,7 @@ OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": 
 
 def get_meaning(graph: Graph, name: str, params: Parameters, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """Return what an operation does to entries, of arrays of which the last has a type."""
+    # Unsigned and signed integers mean the same; their ranges are in `integers.within`.
     table = OF_ALL | {"f": OF_DOUBLES, "b": OF_TRUTH}.get(dtype.kind, integers.OF_INTEGERS)
     if name in table:
         return partial(table[name], graph, params, dtype)

@@ -32,6 +32,7 @@ def _pad(params: Parameters, a: TracedArray, value: TracedArray) -> TracedArray:
 
 
 MOVING_OPERATIONS: dict[str, Callable[..., Any]] = {
+    # NumPy moves objects as it moves numbers: these operations cost nothing at run time.
     **{name: lambda params, a, *_, move=move: move(a, params) for name, move in SELECTIONS.items()},
     "broadcast_in_dim": broadcast_in_dim,
     "concatenate": lambda params, *a: np.concatenate(a, axis=params["dimension"]),

@@ -55,6 +55,7 @@ def trace_scalars(
         jaxpr, _ = drop_unused(closed.jaxpr, True)
         with np.errstate(all="ignore"):
             outputs = _Tracing(graph).run(jaxpr, closed.consts, inputs)
+        # A function that returns float32 or integers is evaluated by JAX, with its own rounding.
         if any(array_type(variable).dtype != np.float64 for variable in closed.jaxpr.outvars):
             raise Unsupported("returns something else than float64")
     except Unsupported as error:
@@ -81,6 +82,7 @@ class _Tracing(Walk):
 
     def apply(self, equation: Equation, given: list[TracedArray], origin: Equation) -> Sequence[TracedArray]:
         try:
+            # Here, not at the end: a loop of a million turns would fill the memory before.
             if len(self._graph.nodes) > MOST_NODES:
                 raise Unsupported(f"takes more than {MOST_NODES} operations")
             return [as_numpy(value) for value in _apply(self._graph, equation, given)]
