@@ -56,7 +56,7 @@ def compute_seal(arrays: Mapping[str, NDArray[Any]]) -> str:
     return compute_fingerprint(*(part for name in sorted(arrays) for part in (name, np.asarray(arrays[name]))))
 
 
-def compute_fingerprint(*parts: Any) -> str:
+def compute_fingerprint(*parts: object) -> str:
     """Return a digest of numbers, strings and arrays."""
     digest = hashlib.sha256()
     for part in parts:

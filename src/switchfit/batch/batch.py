@@ -16,9 +16,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, Traced
 from switchfit.batch.ends import Chunk
 from switchfit.batch.failures import describe_error, is_raised_in_callback
 from switchfit.batch.layout import ProgramLayout, Varying, choose_layout, has_gpu
@@ -50,7 +50,7 @@ _NO_PROGRAM = (
 )
 
 
-def pad_fits(values: Any, size: int) -> FloatArray:
+def _pad_fits(values: ArrayLike, size: int) -> FloatArray:
     """Repeat the last of `values` (R, ...) up to `size`: the number of fits must not shape the program."""
     array = np.asarray(values)
     return np.concatenate([array, np.repeat(array[-1:], size - len(array), axis=0)]) if len(array) < size else array
@@ -99,7 +99,7 @@ class Batch:
     @cached_property
     def _values(self) -> tuple[jax.Array, ...]:
         """Return the data of all fits as arrays of JAX, which otherwise copies them in each call of a program."""
-        return tuple(jnp.asarray(pad_fits(value, self.layout.size)) for value in self.varying.values())
+        return tuple(jnp.asarray(_pad_fits(value, self.layout.size)) for value in self.varying.values())
 
     def fit(self, starts: FloatArray) -> Chunk:
         """Fit all of them.
@@ -137,7 +137,7 @@ class Batch:
         together = np.flatnonzero(~alone)
         for first in range(0, len(together), EVALUATIONS):
             call = together[first : first + EVALUATIONS]
-            padded = [pad_fits(each[call], EVALUATIONS) for each in (fits, thetas, sides.astype(float))]
+            padded = [_pad_fits(each[call], EVALUATIONS) for each in (fits, thetas, sides.astype(float))]
             found = self._run(evaluate_fits, *padded, len(call))
             for all_, each in zip(at, found, strict=True):
                 all_[call] = each[: len(call)]
@@ -149,7 +149,7 @@ class Batch:
                 at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
         return at
 
-    def _run(self, program: Callable[..., Any], *own: Any) -> Any:
+    def _run(self, program: Callable[..., Traced], *own: Traced) -> Traced:
         """Return the results of a program as arrays of NumPy; `own` is what it is given beside inputs and data."""
         with use_float64(), self._use_device():
             given = (self._inputs, self._values, *own)
@@ -171,7 +171,7 @@ class Batch:
         limits = self.limits._replace(max_iterations=self.limits.max_iterations // 2)
         inward = self.evaluator.problem.unknowns.variables.inward(starts)
         try:
-            found = self._run(minimize_fits, limits, pad_fits(inward, self.layout.size), len(starts))
+            found = self._run(minimize_fits, limits, _pad_fits(inward, self.layout.size), len(starts))
         except Exception as error:
             # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
             # fits are then done one by one, and that one is listed. Any other error is a defect of the program.

@@ -6,6 +6,7 @@ bytes), and the digest of `switchfit.batch.archives`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import make_dataclass, replace
 from typing import Any, get_type_hints
 
@@ -35,7 +36,7 @@ def describe_best(best: Estimate) -> dict[str, Any]:
     return write_fit(best.complete(), best.known_certificate or certify(best, None))
 
 
-def load_best(content: Any) -> Estimate | None:
+def load_best(content: Mapping[str, object] | None) -> Estimate | None:
     """Return the estimate with the content of its file; None if there is none.
 
     Parameters

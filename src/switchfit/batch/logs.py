@@ -93,7 +93,7 @@ class StudyOfLogs(Study):
         return self.describe_fits(chunk, runs) | {"pieces": make_no_pieces(self.problem, 1)}
 
 
-def _get_kind(problem: Problem) -> Any:
+def _get_kind(problem: Problem) -> tuple[object, ...]:
     """Return a key that is equal for problems that one program can fit with one set of constraints."""
     evaluator = evaluator_of(problem)
     shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(tuple(evaluator.arguments)))

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from switchfit.arrays import Traced
 from switchfit.batch.layout import ProgramLayout
 from switchfit.discretization.arguments import Arguments
 from switchfit.engine.choice import derivatives_inside_program
@@ -49,8 +50,8 @@ class ProgramInputs(NamedTuple):
     sequences: tuple[dict[str, Any], ...]
     priors: PriorTerms
     variables: Variables
-    lower: Any
-    upper: Any
+    lower: Traced
+    upper: Traced
     constraints: TracedConstraints
 
     @classmethod
@@ -65,11 +66,13 @@ class ProgramInputs(NamedTuple):
         of_theta = unknowns.priors, variables, unknowns.lower, unknowns.upper
         return cls(tuple(evaluator.arguments), times, sequences, *of_theta, TracedConstraints(*rows))
 
-    def find_theta(self, z: Any) -> Any:
+    def find_theta(self, z: Traced) -> Traced:
         """Return theta (d,) at z, the variables of the optimiser."""
         return jnp.clip(self.variables.outward(z, jnp), self.lower, self.upper)
 
-    def evaluate(self, layout: ProgramLayout, own: Sequence[Any], theta: Any, side: Any) -> tuple[Any, Any, Any]:
+    def evaluate(
+        self, layout: ProgramLayout, own: Sequence[Traced], theta: Traced, side: Traced
+    ) -> tuple[Traced, Traced, Traced]:
         """Return cost, gradient and Hessian of a fit with its own data, inside a program.
 
         Experiments that share a structure and all lengths are taken in a loop, so that the program does not grow with
@@ -86,7 +89,7 @@ class ProgramInputs(NamedTuple):
             tau = jnp.where(where[:, :N] < d, extended[where[:, :N]], fixed)
             given = jax.tree.map(lambda *leaves: jnp.stack(leaves), *((arguments[e], self.sequences[e]) for e in group))
 
-            def one(given: Any, structure: Structure = structure) -> tuple[jax.Array, jax.Array, jax.Array]:
+            def one(given: Traced, structure: Structure = structure) -> tuple[jax.Array, jax.Array, jax.Array]:
                 (own, sequence), tau, p = given
                 return derivatives_inside_program(structure, own, tau, p, side, sequence)
 

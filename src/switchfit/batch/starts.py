@@ -197,7 +197,7 @@ def _find_best(problem: Problem, fits: Fits, limits: Limits) -> tuple[Fits, Esti
     return replace(fits, status=status.astype(str), message=message.astype(str)), best
 
 
-def _check_starts(problem: Problem, starts: Any) -> FloatArray:
+def _check_starts(problem: Problem, starts: object) -> FloatArray:
     """Return starts of the user's, checked."""
     points = as_array(starts, "starts")
     d = len(problem.theta_names)

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, Traced
 
 POWERS = {"D": 0.0, "A": 1.0, "E": 1e3}
 """Powers q of the criteria; that of E stands for infinity, from which log m differs by less than 0.001 log s."""
@@ -46,7 +46,7 @@ class Criterion(NamedTuple):
     basis: FloatArray
     size: FloatArray
 
-    def rate(self, information: Any, power: float, xp: Any = np) -> tuple[Any, Any]:
+    def rate(self, information: Traced, power: float, xp: Any = np) -> tuple[Traced, Traced]:
         """Return log m (...,), and its derivative in the information (..., d, d).
 
         Parameters

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, Traced
 from switchfit.discretization.arguments import Arguments, build_arguments, split_by_cell
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate
@@ -51,11 +51,11 @@ class Background(NamedTuple):
     """
 
     arguments: Arguments
-    cells: Any
-    theta: Any
+    cells: Traced
+    theta: Traced
     taken: tuple[Any, ...]
-    others: Any
-    places: Any
+    others: Traced
+    places: Traced
     criterion: Criterion
 
 

@@ -188,7 +188,7 @@ def _check_data(problem: Problem) -> None:
                 raise ValueError(f"design needs sigma, the standard deviation of the noise, for the data of {name}.")
 
 
-def _find_chosen(problem: Problem, names: Any) -> tuple[NDArray[np.intp], FloatArray]:
+def _find_chosen(problem: Problem, names: object) -> tuple[NDArray[np.intp], FloatArray]:
     """Return the positions in theta of the unknowns that count, and their scales: (s,) each."""
     known, spans = list(problem.theta_names), problem.unknowns.parameters
     given = known if names is None else [names] if isinstance(names, str) else names

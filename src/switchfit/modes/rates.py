@@ -21,7 +21,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,7 +35,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation.arrays import as_count
 from switchfit.problem.validation.objects import as_instance
-from switchfit.runtime.presentation import Printed, draw_figure, format_line
+from switchfit.runtime.presentation import Axes, Figure, Printed, draw_figure, format_line
 
 
 class Pulse(NamedTuple):
@@ -135,7 +135,7 @@ class Insertion(Printed):
             found += [Pulse(mode, float(self.times[r]), float(known[r])) for r in lowest.tolist()]
         return sorted(found, key=lambda pulse: pulse.rate)
 
-    def plot(self, *, ax: Any = None) -> Any:
+    def plot(self, *, ax: Axes | None = None) -> Axes | Figure:
         """Draw the rate of each mode over time, with the modes that are active shaded.
 
         Parameters

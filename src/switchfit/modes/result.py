@@ -25,7 +25,7 @@ from switchfit.problem.validation.messages import join_names
 from switchfit.problem.validation.objects import as_instance, as_path
 from switchfit.runtime.json_documents import read_document, write_document
 from switchfit.runtime.json_records import from_json, to_json
-from switchfit.runtime.presentation import Displayed, draw_figure, format_line
+from switchfit.runtime.presentation import Displayed, Figure, draw_figure, format_line
 from switchfit.strategy.library import Library
 
 SEARCH_FORMAT = "switchfit modes"
@@ -297,7 +297,7 @@ class ModeSearch(SearchRecord, Displayed):
             found[rows, np.take(sequence, np.searchsorted(fit.transition_times[e], times, "right"))] += fit.weight
         return found
 
-    def plot(self) -> Any:
+    def plot(self) -> Figure:
         """Draw the criteria by number of switches, the best fit with its modes shaded, and the mode probabilities.
 
         See Also

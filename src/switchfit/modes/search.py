@@ -161,7 +161,7 @@ def _check_experiments(problem: Problem) -> None:
                 )
 
 
-def _check_grid(grid: Any, problem: Problem) -> float:
+def _check_grid(grid: object, problem: Problem) -> float:
     length, least = as_positive(grid, "grid"), max(run.end - run.t0 for run in problem.experiments) / MOST_GRID_PLACES
     if length < least:
         raise ValueError(f"grid must be at least {least:g}, a millionth of the longest experiment; got {length:g}.")
@@ -169,7 +169,7 @@ def _check_grid(grid: Any, problem: Problem) -> float:
 
 
 def _check_criterion(
-    problem: Problem, criterion: Any, switch_cost: Any
+    problem: Problem, criterion: object, switch_cost: object
 ) -> tuple[CriterionName | Callable[[Estimate], float], Score, CriterionName]:
     """Return how the number of switches is chosen, what criteria need, and the criterion of the search."""
     chooser: Any = criterion if callable(criterion) else as_choice(criterion, "criterion", CRITERIA)

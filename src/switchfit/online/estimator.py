@@ -149,7 +149,7 @@ class OnlineEstimator:
         false_alarms: float | None = None,
         threshold: float | None = None,
         successions: Mapping[str, Any] | None = None,
-        min_duration: Any = None,
+        min_duration: float | Mapping[str, float] | None = None,
         renews: Mapping[str, str | Sequence[str]] | None = None,
         drift: Mapping[str, float] | None = None,
         max_switches: int = 8,
@@ -207,7 +207,7 @@ class OnlineEstimator:
         if false_alarms is not None:
             self.set_threshold(calibrate(self, false_alarms).threshold)
 
-    def _find_places(self, names: Any, what: str) -> NDArray[np.intp]:
+    def _find_places(self, names: object, what: str) -> NDArray[np.intp]:
         """Return the positions of free parameters, a name or several, among the D unknowns of the engine."""
         chosen = as_names((names,) if isinstance(names, str) else names, what, "the name of a parameter, or several")
         if not chosen:
@@ -288,7 +288,7 @@ class OnlineEstimator:
 
     # --- samples ---------------------------------------------------------------------------------------------------
 
-    def update(self, t: float, y: Any = None, *, u: ArrayLike | Mapping[str, float] | None = None) -> Now:
+    def update(self, t: float, y: object = None, *, u: ArrayLike | Mapping[str, float] | None = None) -> Now:
         """Take a sample, and return what is known then.
 
         Parameters
@@ -359,7 +359,7 @@ class OnlineEstimator:
         usual = self._costs[what]
         self._costs[what] = 0.8 * usual + 0.2 * (clock.perf_counter() - began) if done else 0.95 * usual
 
-    def _read(self, y: Any) -> dict[int, FloatArray]:
+    def _read(self, y: object) -> dict[int, FloatArray]:
         """Return the values (q,) of the sensors of an update by their places, NaN where one is missing."""
         if y is not None and not isinstance(y, Mapping):
             if len(self._sensors) > 1:
@@ -386,7 +386,7 @@ class OnlineEstimator:
                 raise ValueError(f"y must be finite, or NaN where a value is missing; got {shorten(row.tolist())}.")
         return {k: row for k, row in found.items() if np.isfinite(row).any()}
 
-    def _place(self, t: float, samples: dict[int, FloatArray], u: Any) -> int:
+    def _place(self, t: float, samples: dict[int, FloatArray], u: ArrayLike | Mapping[str, float] | None) -> int:
         """Put the samples of an update into the log, and return the first node that is to be computed."""
         feed, tracker = self._feed, self._tracker
         seen = [(t - float(self._sensors[k].delay), k) for k in samples]
@@ -433,7 +433,7 @@ class OnlineEstimator:
             found = np.unique(np.concatenate([found, inside])).tolist()
         return found
 
-    def _hold(self, u: Any) -> FloatArray | None:
+    def _hold(self, u: ArrayLike | Mapping[str, float] | None) -> FloatArray | None:
         """Return the inputs up to this update, after which those that come with it hold."""
         before, run = self.held, self.problem.experiments[0]
         if u is None:
@@ -728,7 +728,7 @@ class OnlineEstimator:
         )
 
     def _declare(
-        self, t: float, modes: Any, times: FloatArray, statistic: float, best: Best
+        self, t: float, modes: NDArray[np.int64], times: FloatArray, statistic: float, best: Best
     ) -> tuple[Alarm | None, Alarm | None]:
         """Declare a sequence of modes; return the alarm, and the one that it retracts."""
         declared = self._tracker.declared

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
 
@@ -32,7 +34,7 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
     return numbers, arrays
 
 
-def append_update(path: Path, t: float, y: dict[int, FloatArray], u: Any) -> None:
+def append_update(path: Path, t: float, y: dict[int, FloatArray], u: ArrayLike | Mapping[str, float] | None) -> None:
     """Write an update to a journal, with the values of each sensor; it leaves the process before the update begins."""
     line = json.dumps({"t": t, "y": y, "u": u}, default=lambda value: np.asarray(value, dtype=np.float64).tolist())
     with path.open("ab", buffering=0) as file:

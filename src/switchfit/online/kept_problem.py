@@ -6,12 +6,14 @@ parameters.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.arrays import Traced
 from switchfit.modes.schedule import Schedule, drop_empty
 from switchfit.online.state import Now
 from switchfit.online.window_start import Start
@@ -82,12 +84,12 @@ def _describe_arrival(problem: Problem, arrival: Start, t0: float) -> tuple[Any,
     if (unknowns.initial_states[0] >= 0).any():
         names.append(INITIAL_STATE_PARAMETER)
 
-    def move(p: Any) -> Any:
+    def move(p: Mapping[str, Traced]) -> Traced:
         parameters = [jnp.ravel(jnp.asarray(p[name])) for name in names]
         entries = [p[START_STATE_PARAMETER]] if has_entries else []
         return jnp.concatenate([*entries, jnp.concatenate([*parameters, jnp.zeros(0)]) - arrival.moved])
 
-    def begin(p: Any) -> Any:
+    def begin(p: Mapping[str, Traced]) -> Traced:
         return arrival.state + arrival.tangent @ move(p)
 
     sensor = Measurements([t0], [-s], observe=lambda t, x, p: R @ move(p), sigma=1.0)

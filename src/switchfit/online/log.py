@@ -18,7 +18,7 @@ from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation.arrays import as_array
 from switchfit.problem.validation.objects import as_callable, as_instances
-from switchfit.runtime.presentation import Printed, draw_figure, format_line
+from switchfit.runtime.presentation import Figure, Printed, draw_figure, format_line
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ class OnlineLog(Printed):
         values = np.percentile(self.seconds, [50, 90, 99, 100]).tolist()
         return dict(zip(("p50", "p90", "p99", "max"), values, strict=True))
 
-    def plot(self) -> Any:
+    def plot(self) -> Figure:
         """Draw modes, statistic and parameters over time; return the Matplotlib figure.
 
         See Also

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.runtime import special
@@ -19,7 +17,9 @@ CLEARLY_OFF = 0.1
 off, which no instrument is known to."""
 
 
-def compare_with_sigma(chi_square: Any, freedom: Any, tests: int = 1) -> tuple[FloatArray, NDArray[np.bool_]]:
+def compare_with_sigma(
+    chi_square: ArrayLike, freedom: ArrayLike, tests: int = 1
+) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return the probability of chi-square, or of a larger one, and whether it is not far too small: sigma is then no
     measure of the noise. The probability of one that is not clearly too large is 1; that of each of several tests is
     multiplied by their number.

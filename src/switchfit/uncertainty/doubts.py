@@ -18,13 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.uncertainty.chi_square import UNLIKELY_AS_NOISE
 from switchfit.uncertainty.explained_variance import HALF, NO_RESIDUALS
+
+OfFits: TypeAlias = Any
+"""A number of one fit, or an array (F,) with that of each of many: the same rules judge both."""
 
 Level = Literal["good", "doubtful", "bad"]
 VERDICT_LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
@@ -79,17 +82,17 @@ class Numbers:
     """
 
     converged: NDArray[np.bool_]
-    error: Any = 0.0
-    lower: Any = 0
-    tried: Any = 0
-    agreeing: Any = 0
-    explained: Any = np.nan
-    probability: Any = np.nan
-    known: Any = False
-    freedom: Any = np.inf
-    collapsed: Any = 0
-    at_bounds: Any = 0
-    smallest: Any = np.inf
+    error: OfFits = 0.0
+    lower: OfFits = 0
+    tried: OfFits = 0
+    agreeing: OfFits = 0
+    explained: OfFits = np.nan
+    probability: OfFits = np.nan
+    known: OfFits = False
+    freedom: OfFits = np.inf
+    collapsed: OfFits = 0
+    at_bounds: OfFits = 0
+    smallest: OfFits = np.inf
     references: bool = False
 
 
