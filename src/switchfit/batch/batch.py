@@ -113,6 +113,8 @@ class Batch:
             Feasible.
         """
         problem = self.evaluator.problem
+        # The program has no guards, no logarithmic times and no corners: such fits begin at their starts, and
+        # `minimize` does all of them.
         has_crossings = any(map(has_corners, problem.structures))
         if problem.constraint_names or problem.unknowns.log_times.any() or has_crossings:  # unknown to the program
             outcome = Outcome.at_starts(starts, np)
@@ -133,10 +135,12 @@ class Batch:
         """
         n, d = thetas.shape
         at = Derivatives(np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan))
+        # Fits on meshes of their own, and those that JAX would have to compile once more, are evaluated one by one.
         alone = np.isin(fits, list(self.own)) | (not self.layout.natively)
         together = np.flatnonzero(~alone)
         for first in range(0, len(together), EVALUATIONS):
             call = together[first : first + EVALUATIONS]
+            # Every call has the same length, whatever is left: another shape would be another program.
             padded = [_pad_fits(each[call], EVALUATIONS) for each in (fits, thetas, sides.astype(float))]
             found = self._run(evaluate_fits, *padded, len(call))
             for all_, each in zip(at, found, strict=True):
@@ -162,6 +166,7 @@ class Batch:
             values = [jnp.asarray(value[k]) for value in self.varying.values()]
             arguments = replace_leaves(self._base, self.varying, values)
         given = zip(self.evaluator.meshes, arguments, strict=True)
+        # Data may bring times of their own, whose nodes are in the arguments: the mesh of this fit is made of these.
         meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in given]
         return Evaluator(self.evaluator.problem, meshes=meshes, arguments=arguments)
 
@@ -192,6 +197,8 @@ class Batch:
         def build(meshes: Sequence[Mesh]) -> Evaluator:
             return Batch(problem, meshes, varying, limits)._give_data(k)
 
+        # All leaves vary: sample times too, so that a mesh for the data of this fit alone cannot be shared by a
+        # follower.
         if len(varying) == len(jax.tree.leaves(self._base)):
             return minimize_cost(evaluator, start, "exact", *limits)
         # A trust region takes fewer steps.
@@ -204,6 +211,7 @@ class Batch:
         # Held coordinates are left out of the covariance: rows of the identity in H, zero in its inverse.
         either = (held[:, :, None] | held[:, None, :])[settled]
         hessians = np.where(either, np.eye(held.shape[1]), chunk.hessian[settled])
+        # The batch inverts all Hessians in one call; those of fits that are done again are inverted there.
         chunk.covariance[settled] = np.linalg.inv(hessians) * ~either
         chunk.free[settled] -= held[settled].sum(axis=1)
         sides = np.stack([outcome.left, outcome.gradient], axis=2)

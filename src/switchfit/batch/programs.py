@@ -79,6 +79,7 @@ def minimize_fits(
             J, g, H = inputs.evaluate(layout, own, theta, side)
             return J, *variables.derivatives_inward(theta, g, H, jnp)
 
+        # Breakpoints are data, too: with sample times of its own, each fit has kinks elsewhere.
         breakpoints = _list_breakpoints(layout, inputs.times, replace_leaves(inputs.arguments, layout.varying, own))
         found = minimize_traced(TracedProblem(evaluate, inputs.constraints, breakpoints, *limits), start)
         theta = inputs.find_theta(found.theta)
@@ -86,6 +87,8 @@ def minimize_fits(
         gradient, hessian = variables.derivatives_outward(theta, found.gradient, found.hessian, jnp)
         return found._replace(theta=theta, gradient=gradient, hessian=hessian, left=left)
 
+    # On a GPU all fits take a step together, and wait for the slowest; on cores one after the other is faster, as none
+    # waits.
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)
     empty = Outcome.at_starts(starts)
@@ -132,5 +135,6 @@ def _list_breakpoints(
     if not nodes:
         return TracedBreakpoints(np.zeros(0, np.intp), jnp.zeros((0, 1)))
     longest = max(len(a) for a in nodes.values())
+    # Infinite breakpoints are never met: they make the arrays of all times as long as the longest.
     padded = [jnp.pad(a, (0, longest - len(a)), constant_values=jnp.inf) for a in nodes.values()]
     return TracedBreakpoints(np.array(list(nodes)), jnp.stack(padded))

@@ -134,6 +134,8 @@ class Study:
             if self.problem.constraint_names:
                 self._redo_doubted(chunk, runs, batch)
         self._free_kinks(chunk, runs)
+        # Layers of the mesh move with theta: on the one mesh of a batch, J has steps there that a walk would take for
+        # kinks.
         if self.is_finished and not any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
             pieces = trace_chunk(chunk, self.group_fits(runs), batch)
         return self.describe_fits(chunk, runs) | {"pieces": pieces}
@@ -143,6 +145,7 @@ class Study:
         if self.problem.constraint_names or not chunk.at_kink.any():
             return
         found, known = self.describe_fits(chunk, runs), self.problem.is_sigma_known
+        # As for a single fit (`Fit.free_kinks`), but for all of the chunk at once.
         freedom = found["samples"] + count_priors(self.problem) - chunk.free
         scale = measure_variance(chunk.cost, freedom, known)
         for k in np.flatnonzero(chunk.at_kink.any(axis=1) & (found["collapsed"] == 0)).tolist():
@@ -197,6 +200,7 @@ class Study:
 
     def _find_doubted(self, chunk: Chunk, runs: range) -> NDArray[np.bool_]:
         """Return of which fits a better end may be elsewhere: not converged, a mode collapsed, or far from the data."""
+        # Doubts that another start may settle; what the data cannot tell is no reason to fit once more.
         kinds = "not converged", "a mode collapsed", "little explained", *doubts_module.EXPLAINED_BADLY
         arrays, known = self.describe_fits(chunk, runs), self.problem.is_sigma_known
         doubts = [d for d in doubts_module.find_doubts(arrays, known, count_priors(self.problem)) if d.kind in kinds]
@@ -216,6 +220,8 @@ class Study:
         """Return a digest of everything that a result depends on."""
         unknowns, data = self.problem.unknowns, self.stack_data([0])[0]  # run 0 stands for all
         bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
+        # What varies is in the data of each run; the digest has what all runs share, and run 0 for the shapes and seeds
+        # of the rest.
         shared = [np.asarray(leaf) for place, leaf in enumerate(self.leaves[0]) if place not in data]
         settings = type(self).__name__, self.limits, self.seed, unknowns.names, self.problem.solver
         return compute_fingerprint(

@@ -73,6 +73,8 @@ class Fitter:
         self._evaluators: dict[Any, Evaluator] = {}
         self._experiments: list[ExperimentsByOrder] = [{} for _ in self.runs]
         self._results: dict[Any, Fitted] = {}
+        # Caches that end with the fitter: with `lru_cache` on the methods, every fitter of a process would stay in
+        # memory.
         self._trace = cache(lambda e, pair: trace_transition(self.problem, self.problem.experiments[e], pair))
         self._build_structure = cache(self._place_functions)
         self.find_acting = cache(self._find_acting)
@@ -134,6 +136,8 @@ class Fitter:
             tuple(np.searchsorted(schedule.times, run.jump_times, "left").tolist())
             for schedule, run in zip(schedules, self.runs, strict=True)
         )
+        # The sequence alone is no key where the state jumps at known times: on which side of a jump a transition lies
+        # decides which transitions the structure has.
         key = tuple(schedule.sequence for schedule in schedules), jumps
         if key not in self._evaluators:
             self._evaluators[key] = self._build_evaluator(schedules)
@@ -185,6 +189,8 @@ class Fitter:
             priors = self.problem.unknowns.priors
             if priors.any:
                 found += priors.evaluate(np.concatenate([self.problem.initial_theta[: self.first], parameters]))[0]
+            # NaN is what machine code could not say, as where a check of finiteness failed: the evaluator, which falls
+            # back to JAX, says whether J is finite there.
             for i in np.flatnonzero(np.isnan(found)).tolist():
                 found[i] = self._evaluate([*schedules[:e], moved[i], *schedules[e + 1 :]], parameters)
             return np.where(np.isfinite(found), found, np.inf)
@@ -260,6 +266,7 @@ class Fitter:
             return failed
         theta = np.concatenate([*(schedule.times for schedule in feasible), start])
         key = tuple(schedule.sequence for schedule in feasible), theta.tobytes()
+        # Different moves lead to the same schedule and parameters, to the last bit: each such fit is done once.
         if key not in self._results:
             self.fits += 1
             self._results[key] = self._fit(feasible, theta, failed)
@@ -272,6 +279,8 @@ class Fitter:
             return replace(failed, cost=cost if np.isfinite(cost) else np.inf)
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             evaluator = self.get_evaluator(schedules)
+        # Parameters that act in no mode of the sequence have zero rows in the Hessian, which would be taken for flat
+        # directions: they are held.
         held = self._hold(evaluator.problem.constraints, theta, failed.acting)
         end = fit_briefly(evaluator.problem, theta, evaluator=evaluator, constraints=held)
         self.evaluations += end.evaluations
@@ -289,6 +298,8 @@ class Fitter:
         is_plain = None not in self._simulators and not any(map(has_corners, problem.structures))
         if problem.constraint_names or not is_plain:
             return Evaluator(problem, meshes=self.meshes)
+        # Not by its constructor, which makes meshes and engines for this sequence: those of the library serve all of
+        # them.
         found = object.__new__(Evaluator)
         found.problem, found.meshes, found.arguments = problem, self.evaluator.meshes, self.evaluator.arguments
         given = zip(problem.structures, found.arguments, found.meshes, self._experiments, strict=True)
@@ -347,6 +358,7 @@ class Fitter:
         self.evaluations += 1
         if not np.isfinite(here.cost):
             return np.inf
+        # min over d of J + g'd + d'H d / 2 is J - g'H^-1 g / 2; Cholesky fails where H is not positive definite.
         _, step, has_no_minimum = lapack.dposv(here.hessian[np.ix_(free, free)], -here.gradient[free])
         return -np.inf if has_no_minimum else here.cost + 0.5 * float(here.gradient[free] @ step)
 

@@ -103,6 +103,8 @@ class Judge:
 
     @property
     def _weighs_by_mbic(self) -> bool:
+        # AICc chooses by prediction and not by the probability of a number: only a discount makes mBIC decide for it,
+        # too.
         of_number = self.chooser != "aicc" or self.pool.as_it_stands is not None
         return of_number and self.pool.score.has_information(self.chooser)
 
@@ -118,6 +120,8 @@ class Judge:
         self, fit: Fitted, values: dict[ModeSequences, float], weights: dict[ModeSequences, float]
     ) -> ModeFit:
         pool, known = self.pool, self.certifier.find(fit.sequences)
+        # The estimate was fitted on meshes of its own to the full tolerance: where there is one, its numbers are
+        # reported.
         cost, times = fit.cost, tuple(schedule.times for schedule in fit.schedules)
         if known is not None:
             cost, times = known.cost, tuple(np.array(t) for t in known.transition_times)
@@ -142,6 +146,7 @@ class Judge:
             "held": self._list_held(best, read=False),
             "limit": self.certifier.library.max_switches,
         }
+        # In this order: what makes all later judgements meaningless ends it.
         if self.interrupted:
             return ModeEnding(ModeStatus.INTERRUPTED, **facts)
         if estimate is not None and not estimate.status.successful:
@@ -202,6 +207,7 @@ class Judge:
         most = self.certifier.library.max_switches
         if not any(schedule.switches == most for schedule in best.schedules):
             return False
+        # With two modes that alternate, the limit may be odd where only even numbers can follow: that is no limit.
         longer = replace(self.certifier.library, max_switches=most + len(self.certifier.library.modes) + 1)
         return any(switches > most for switches in longer.possible_switches)
 

@@ -164,16 +164,20 @@ class SearchRun:
         with show_line("search for the mode sequence"):
             try:
                 self._search()
+                # What nothing explains may be the noise, which one search with another loss or sigma shows, or else a
+                # search that was too narrow.
                 if self._is_explained() is False:
                     found = self._assume_other_noise()
                     if found is not None:
                         return found
                     self._widen()
                 self.improver.fill_numbers()
+                # Another criterion prefers another number of switches: moves are tried once more, by what counts now.
                 if self._discount():
                     self.improver.improve()
                     self.improver.fill_numbers()
                 if self.pool.is_explained() is not False and self.score.sigma_known is not None:
+                    # Around a best that explains nothing, all neighbours are as good: to look there would say nothing.
                     untraced = look_around(self.improver)
             except (KeyboardInterrupt, _StoppedError):
                 interrupted = True
@@ -200,6 +204,7 @@ class SearchRun:
             draw_starts(self.fitter.problem, 1 + MOST_RANDOM_STARTS, self.settings.seed)[1:, self.fitter.first :]
         )
         best, waited = self.pool.best, 0
+        # The best parameters first: with four times the hypotheses, the beam may leave them another way.
         for start in starts if best is None else [best.parameters, *starts]:
             before = self.pool.lowest
             self._search_from(start, WIDTH_FACTOR * self.settings.width)
@@ -227,6 +232,8 @@ class SearchRun:
 
         if runs:
             self._report("beam")
+            # Each run has a beam of its own, in which the evidence of the others on shared parameters is a quadratic
+            # cost.
             beams = Beams(self.fitter.problem, [each.own for each in runs])
             self.improver.polish_proposals(beams.join(*beams.follow(start, follow_run)))
         else:
@@ -262,6 +269,7 @@ class SearchRun:
         fault = "model" if estimate is None else measure_quality(estimate).suspect
         if estimate is None or fault == "model":
             return None
+        # `assumes` keeps the inner search from doubting the noise once more.
         problem = assume_fault(self.problem, fault, estimate)
         score = Score.of(problem, self.score.switch_cost)
         found = SearchRun(problem, score, self.settings, assumes=True).run()

@@ -200,6 +200,7 @@ class OnlineEstimator:
             self._find_places(name, "drift")
             step = as_positive(walks[name], f"drift of {name}")
             self._walks[self._slices[name]] = as_positive(step * step, f"the square of the drift of {name}")
+        # One wild sample shall not make a model that is right look lost: its share of chi-square is cut off here.
         self._outlier = float(special.chdtri(sum(map(len, self._weights)), OUTLIER))
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
         self._journal: Path | None = None
@@ -325,12 +326,15 @@ class OnlineEstimator:
             raise StoppedError(self._stopped)
         samples = self._read(y)
         if self._journal is not None:
+            # Before anything is computed: a process that is killed in between finds the sample again.
             append_update(self._journal, t, samples, u)
         changed = self._place(t, samples, u)
         try:
             complete = self._follow(changed, began)
             self.now = self._judge(t, began, complete=complete)
         except StoppedError as error:
+            # The model cannot be simulated any more, and no later sample changes that: all updates are refused until
+            # `reset`.
             self._stopped = error.t
             if self.now is not None:
                 self.now = replace(self.now, status=OnlineStatus.STOPPED, alarm=None, retracted=None)
@@ -342,6 +346,7 @@ class OnlineEstimator:
         births = self._may("births", began)
         self._tracker.advance(changed, births)
         self._charge("births", began, births)
+        # After the step and before the polish: what leaves the window must not be computed anew from its start.
         self._slide()
         middle = clock.perf_counter()
         polish = births and self._may("polish", began)
@@ -389,6 +394,7 @@ class OnlineEstimator:
     def _place(self, t: float, samples: dict[int, FloatArray], u: ArrayLike | Mapping[str, float] | None) -> int:
         """Put the samples of an update into the log, and return the first node that is to be computed."""
         feed, tracker = self._feed, self._tracker
+        # A sample that comes with a delay belongs to the state at t - delay: that is its node.
         seen = [(t - float(self._sensors[k].delay), k) for k in samples]
         begin = float(feed.nodes[tracker.first])
         for time, k in [(t, None), *seen]:
@@ -400,13 +406,18 @@ class OnlineEstimator:
                 )
             if k is not None and feed.nodes[node] == time and feed.has_sample(k, node):
                 raise ValueError(f"there are two samples of one sensor at t = {time:.9g}.")
+        # Nothing is new so far: `changed` falls to the earliest node that this update touches.
         changed = feed.count if self.now is not None else 0
         held = self._hold(u)
         if t > feed.last:
             gap = t - feed.last
+            # The spacing of the log is known with its second sample: the tracker, whose births are scaled by it, begins
+            # anew.
             if self.spacing is None and self.now is not None:
                 self.spacing, changed = gap, 0
                 self._tracker = self._start_tracking()
+            # A long gap gets nodes of its own: a row must not be much longer than what the hypotheses were linearised
+            # for.
             count = ceil(min(gap / (LONGEST_GAP * (self.spacing or gap)), MOST_BETWEEN))
             for time in self._list_times(feed.last, t, count, held):
                 node = feed.insert(time)
@@ -447,6 +458,7 @@ class OnlineEstimator:
         given = as_array(u, "u").reshape(-1).copy()
         if given.shape != (self._signal.channels,) or not np.isfinite(given).all():
             raise ValueError(f"u must be {self._signal.channels} finite values; got {shorten(given.tolist())}.")
+        # These hold from now on; up to now the ones before hold, which are returned.
         self.held = given
         return given if before is None else before
 
@@ -471,6 +483,7 @@ class OnlineEstimator:
             tracker.leave()
         begins = float(feed.nodes[tracker.first])
         if self._walks.any() and begins - self._renewed >= DRIFT_AFTER * self.window:
+            # A random walk: its variance grows with the time since the parameters were last renewed.
             variances = self._beam.into @ self._walks * (begins - self._renewed)
             places = np.flatnonzero(variances)
             tracker.renew(places, variances[places])
@@ -542,6 +555,7 @@ class OnlineEstimator:
         """
         if self._stopped is not None:
             raise StoppedError(self._stopped)
+        # What is not here follows from the problem and the settings, or is computed anew at the next update.
         names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold", "spacing")
         others = {name: getattr(self, name) for name in names}
         others |= {"held": None if self.held is None else self.held.tolist(), "shape": self._shape}
@@ -630,6 +644,8 @@ class OnlineEstimator:
         online.held = None if numbers["held"] is None else np.array(numbers["held"])
         online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
         online._tracker = online._start_tracking()
+        # The engine of the beam has its limits and tolerances only after a first step; its records are then those of
+        # the file.
         online._tracker.step(births=False)  # gives the engine its settings
         if numbers["shape"] != online._shape:
             raise ValueError(f"{file} was saved for another problem, or with other settings: give the same ones.")
@@ -691,6 +707,8 @@ class OnlineEstimator:
         value = tracker.value(kept.switches, found)
         b, exact, more = tracker.find_best(kept, found, value)
         without = np.inf if exact is None else float(value[exact])
+        # Twice the logarithm of the likelihood ratio: of what was declared against more changes, without the price of
+        # the change.
         statistic = -np.inf if more is None else 2 * (without + penalty - float(value[more]))
         # Below the threshold nothing is declared; what was declared is retracted below half of it.
         if exact is not None and b not in (exact, more) and without - value[b] <= 0.5 * penalty:
@@ -734,6 +752,8 @@ class OnlineEstimator:
         declared = self._tracker.declared
         if declared.tolist() == modes.tolist():
             return None, None
+        # How many modes from the start are as they were declared: an alarm stands for the rest, and those that it
+        # replaces are retracted.
         common = int(np.minimum.accumulate(declared[: len(modes)] == modes[: len(declared)]).sum())
         count = len(declared) - common
         retracted = self._alarms[-count] if 0 < count <= len(self._alarms) else None
@@ -758,6 +778,8 @@ class OnlineEstimator:
         now, (before, known) = self._feed.last, self._fitted
         self._recent = [*self._recent, (min(2 * (lowest - before), self._outlier), self._values - known)][-RECENT:]
         self._fitted = lowest, self._values
+        # By how much twice the lowest cost has risen over the last updates is chi-square of as many values, if the
+        # model holds.
         jumps, counts = (sum(each) for each in zip(*self._recent, strict=True))
         if counts and jumps > find_limit(counts):
             self._lost = now

@@ -134,6 +134,8 @@ class Tracker:
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
         # What H has that is no knowledge: a time that a birth begins with is known to half a spacing.
         self.birth_information = float(12.0 * (beam.noise / beam.reaches[0]) ** 2)
+        # Without a prior a parameter has a weak one, which keeps H positive before the data do; it is taken out again
+        # of what is said.
         weak = np.where(beam.priors.precision > 0, 0.0, (beam.noise / self._pass.spread) ** 2)[beam.places]
         of_births = np.full(beam.births, self.birth_information)
         of_births[: settings.entries] = 0.0
@@ -191,6 +193,8 @@ class Tracker:
         that are.
         """
         late = self.node + 1 - changed
+        # The hypotheses at the node before the late sample are not kept any more: all is propagated anew over the
+        # window.
         if changed and late >= len(self.kept) > 0:
             self.repeat(*self.latest)
             return
@@ -215,6 +219,7 @@ class Tracker:
         t, B = float(self.feed.nodes[node - 1]), len(kept.mode)
         parents, after = rules.list_births(kept, t, np.inf)
         children = kept.list_children(parents, after) if births else kept.list_children(parents[:0], after[:0])
+        # Rows: the parents that go on in their mode, then the children that change it at this node.
         table = self._pass.build_table(kept, children, np.arange(B))
         # The first A unknowns stand for what is before the window: births have the slots behind them.
         table[B:, Column.SLOT] += A
