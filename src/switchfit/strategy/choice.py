@@ -78,6 +78,7 @@ def find_best_fit(
             found = fit_locally(problem, start=start, callback=report, first_cost=first_cost, **settings)
             return JudgedFit.take_over(found)
 
+        # Its meshes are made before work is counted: those of a problem that was fitted before are there already.
         with suppress(NotIntegrableError):  # the fit says why
             evaluator_of(problem)
         prepared = measure_work()

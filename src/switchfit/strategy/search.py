@@ -103,6 +103,7 @@ class Search:
         """Try one strategy after the other until the verdict is good, or no time is left; Ctrl-C ends it with the best
         so far.
         """
+        # Ctrl-C means the end of the search from here on, not that of the program.
         Search.running += 1
         try:
             strategies = [] if self.only_others else self._list_strategies()
@@ -124,6 +125,7 @@ class Search:
         are violated, or a fit that has not converged has gone down into the integration error.
         """
         best = self.best
+        # A fit that has not converged may have gone down into the integration error: its J compares with nothing.
         is_coarse = best is not None and not best.status.successful and best.integration_error > LARGE_INTEGRATION_ERROR
         return np.inf if best is None or best.violated or is_coarse or np.isnan(best.cost) else best.cost
 

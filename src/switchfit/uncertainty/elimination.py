@@ -43,6 +43,7 @@ def eliminate_inside(at: Derivatives, own: Walks, theta: FloatArray, part: Float
     g = at.gradient
     each, inside = np.arange(len(g)), (theta > own.lower) & (theta < own.upper)
     free, step = own.free & (inside | at.hessian.any(axis=2)), np.zeros_like(g)
+    # How far the transition time moves until its stop: what would leave its bound on the way there is held.
     length = (stop - theta[each, own.place])[:, None]
     while True:
         both = free[:, :, None] & free[:, None, :]
@@ -55,6 +56,8 @@ def eliminate_inside(at: Derivatives, own: Walks, theta: FloatArray, part: Float
         except np.linalg.LinAlgError:
             values, vectors = np.linalg.eigh(scaled)
             concave = values[:, 0] < -CONCAVE
+            # H with its negative eigenvalues turned round, as the optimizer does: the Newton step leads downhill, and
+            # not to the saddle.
             turned = (np.abs(values)[:, None, :] * vectors) @ vectors.transpose(0, 2, 1) * scale
             H = np.where(concave[:, None, None] & both, turned, H)
         curvature, newton, follow = eliminate_others(g + _multiply(H, step), H, own.place, free)
@@ -80,6 +83,7 @@ def eliminate_inside(at: Derivatives, own: Walks, theta: FloatArray, part: Float
         room = np.where(follow > 0, own.upper - after, after - own.lower) / np.abs(follow)
         room = np.where(free, room, -slope / change)
     meets = np.fmin.reduce(room, axis=1, where=own.free & (room > 0), initial=np.inf)
+    # J(theta + s) = J + g's + s'H s / 2 falls by -(g + g_after)'s / 2, with the slope g_after = g + H s.
     decrement = -0.5 * np.sum(step * (g + slope), axis=1)
     return Eliminated(slope[each, own.place], curvature, step, follow, decrement, meets, concave)
 

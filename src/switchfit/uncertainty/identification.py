@@ -254,6 +254,8 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
         clean = replace_values(problem, fitted)
         evaluator = Evaluator(clean, meshes=own.meshes)
         # If sigma is a parameter, J has no minimum without noise; its expected Hessian is the Gauss-Newton matrix.
+        # Of data that the guess itself makes: residuals are 0, so that curvature shows what noise would hide, whatever
+        # the log says.
         hessian = evaluator(theta, matrix="exact" if problem.is_least_squares else "gauss-newton").hessian
         if all(item.sigma is not None for item in items):
             rise, meaning = 0.5 * float(special.ndtri(0.975)) ** 2, "noise"
@@ -326,6 +328,7 @@ def _try_direction(
     """Return the change along a direction (d,) at which J should rise by `rise`, and its actual rises on both sides."""
     known = theta != 0
     # No unknown moves by more than its own size, if it is not zero.
+    # A flat direction would have a step without end: an unknown that changes by its own size says enough.
     share = np.max(np.abs(direction[known] / theta[known]), initial=0.0)
     reach = 1.0 / float(share or np.max(np.abs(direction)))
     # J rises by eigenvalue length^2 / 2 along a unit vector of the scaled Hessian.

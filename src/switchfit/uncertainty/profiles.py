@@ -113,7 +113,9 @@ class Profile(Tabular, Displayed):
         runs = [e for e, place in list_transitions(evaluator.problem) if place == k]  # that of a transition time
         self.sample_times = list_sample_times(evaluator.problem, fit.theta, runs[0]) if runs else np.zeros(0)
         self._constraints, self._scale = evaluator.problem.constraints, fit.variance_scale
+        # On halved meshes: a profile compares values of J of different theta, whose integration errors differ.
         self._follower = Follower(halve_cells(evaluator))
+        # At a kink the slopes to both sides differ: each side of the profile begins with its own.
         self._starts = {side: self._describe(fit.theta, self._follower(fit.theta, side), True) for side in (-1, 1)}
         self._centre = self._starts[1]
         self.points, self.fits = [self._centre], 0
@@ -173,6 +175,7 @@ class Profile(Tabular, Displayed):
     def lower_cost(self) -> FloatArray | None:
         """Unknowns (d,) with a cost below that of the estimate, if any were found: start a new fit there."""
         best = min(self.points, key=lambda q: q.cost)
+        # Lower by more than fits agree in: else each profile of a good fit would ask for another one.
         better = best.cost < self._centre.cost - 1e-6 * self._scale
         return best.theta.copy() if better else None
 
@@ -321,6 +324,8 @@ class Profile(Tabular, Displayed):
         predicted, cost = near.predict(value)
         most = 1.5 * self._measure_zeta(cost) + 0.5
         best: ProfilePoint | None = None
+        # The prediction suffices but for jumps to another minimum: then the neighbour's own unknowns, and at last the
+        # estimate's.
         for start in (predicted, near.theta, self._centre.theta):
             found = self._fit(value, start)
             if found is not None:
@@ -350,6 +355,7 @@ class Profile(Tabular, Displayed):
     def _march(self, side: int, threshold: float) -> SideEnding:
         """Add points outwards; return how this ended."""
         ahead, size = 0, abs(self.value) or 1.0
+        # Beyond this many sizes of the unknown, J that has not risen is taken for one that never does.
         far = FLAT_UP_TO_SIZES * (max(size, self.standard_error) if np.isfinite(self.standard_error) else size)
         for _ in range(MOST_POINTS_OF_SIDE):
             last = self._list_side(side)[-1]
@@ -360,6 +366,8 @@ class Profile(Tabular, Displayed):
             )
             if last.value == self.limits[side]:
                 return "crossed" if height >= threshold else "limit"
+            # Behind the threshold a look ahead: a second minimum there would be a second region. Where J falls again,
+            # one more step.
             if height >= MARCHED_BEYOND_THRESHOLD * threshold:
                 if ahead >= LOOK_AHEAD * (1 + (side * last.slope < 0)):
                     return "crossed"
@@ -369,6 +377,8 @@ class Profile(Tabular, Displayed):
             new = self._add_next(side, last, step, most)
             if new is None:
                 return "crossed" if height >= threshold else "failed"
+            # J of the others has fallen to a lower branch: points before it lay on the higher one, and are fitted again
+            # from here.
             if new.cost < last.cost - 1e-9 * abs(last.cost):
                 self._sweep_inward(side)
         return "crossed" if ahead else "flat"
@@ -448,6 +458,7 @@ class Profile(Tabular, Displayed):
         from scipy.optimize import brentq
 
         # zeta is nearly linear in the unknown: a root finder by secants needs a few fits.
+        # Relative to the interval, and to the distance from the estimate: a standard error has no more digits.
         precision = 1e-7 * max(abs(b.value - a.value), min(abs(q.value - self.value) for q in (a, b)))
         root = float(brentq(excess, a.value, b.value, xtol=max(precision, 1e-300), rtol=1e-12))
         # No fit came near the threshold: zeta jumps over it where the minimum in the other unknowns ends.

@@ -256,10 +256,12 @@ def diagnose_channel(comparison: Comparison, k: int, *, unknowns: float = 0.0) -
     """
     raw = comparison.residuals[:, k]
     there = np.isfinite(raw)
+    # Without a sigma, the residuals' own size: their rms is then 1 by construction.
     size = np.sqrt(np.mean(raw[there] ** 2)) if comparison.sigma is None else comparison.sigma[there, k]
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.nan_to_num(raw[there] / size)
     n = len(z)
+    # More lags than a fifth of the values would test noise of the correlations themselves.
     lags = min(10, n // 5)
     r = compute_autocorrelation(z, lags)
     spread = z - z.mean()

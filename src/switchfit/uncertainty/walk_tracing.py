@@ -83,9 +83,11 @@ def trace_walks(
         if not going.size:
             break
         at, theta[going] = Derivatives(*(each[going] for each in lowest)), best[going]
+        # Only ways that go on are computed from here; `each` counts them, `going` says which of all they are.
         own = Walks(*(each[going] for each in walks))
         each, value = np.arange(going.size), theta[going, own.place]
         stop = own.stops[each, passed[going]]
+        # The profile here: slope, curvature, and how the other unknowns follow (the Schur complement of the Hessian).
         found = eliminate_inside(at, own, theta[going], part[going], stop)
         curvature, lost = found.curvature, np.isnan(found.curvature)
         # Another Newton step of the others first, where the one just found would lower J by more than the piece may be
@@ -101,9 +103,12 @@ def trace_walks(
         earlier = _find_cut(piece, pieces[going, kept[going] - 1], reach, found.meets, own.threshold, own.side)
         cut = ~repeat & (halvings[going] < MOST_HALVINGS) & np.isfinite(earlier)
         piece[cut, 1] = earlier[cut]
+        # A piece that is cut off does not reach its stop, and one that is repeated has none yet.
         passed[going] += ~repeat & ~cut
         halvings[going] += cut
         repeats[going] = np.where(repeat, repeats[going] + 1, 0)
+        # Behind the threshold nothing is asked for, and behind the last stop nothing jumps any more: the piece holds to
+        # the limit.
         ended = (reach <= own.side * (piece[:, 1] - value)) | np.isnan(own.stops[each, passed[going]])
         last = lost | (~repeat & ((~cut & ended) | (kept[going] == most - 1)))
         piece[last, 1] = own.limit[last]
