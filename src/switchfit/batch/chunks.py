@@ -28,7 +28,7 @@ CHUNKS_FOR_ONE_MORE_THREAD = 8
 """Chunks a core from which there is one thread more than cores."""
 
 
-def count_cores() -> int:
+def _count_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -91,7 +91,7 @@ def run_chunks(
 
 def _run_in_threads(work: Any, chunks: list[range]) -> Generator[tuple[range, Arrays]]:
     """Yield chunks as they are done by threads; JAX's programs run outside Python's lock."""
-    cores = count_cores()
+    cores = _count_cores()
     # One thread more where there are many chunks: it works while another one waits for the lock.
     pool = ThreadPoolExecutor(cores + (len(chunks) >= CHUNKS_FOR_ONE_MORE_THREAD * cores))
     calls = {pool.submit(work, chunk): chunk for chunk in chunks}

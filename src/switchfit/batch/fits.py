@@ -138,7 +138,7 @@ class Fits(Ends, Tabular, Displayed):
         Each fit is judged by how it ended and by chi-square or the share of the variance that it explains; residuals
         are not tested for correlation, nor channels one by one. `Estimate.verdict` does that for a single fit.
         """
-        return judge_many(self)
+        return _judge_many(self)
 
     @cached_property
     def levels(self) -> NDArray[np.str_]:
@@ -295,7 +295,7 @@ class Fits(Ends, Tabular, Displayed):
             raise ValueError(f"{file} is damaged: {error}.") from error
 
 
-def judge_many(fits: Fits) -> Verdict:
+def _judge_many(fits: Fits) -> Verdict:
     """Return the verdict on fits of many logs, or of anything in which each fit counts by itself."""
     R, doubts = len(fits), fits.doubts
     counts: dict[str, float] = {level: float(np.sum(fits.levels == level)) for level in VERDICT_LEVELS}

@@ -46,14 +46,14 @@ def build_study(
         Where the data are simulated, and where every fit begins.
     limits : Limits
     """
-    clean = simulate_clean(problem, truth)
+    clean = _simulate_clean(problem, truth)
     drawn = noise if callable(noise) else _find_spreads(problem, truth, noise, clean)
     study = SimulatedStudy(problem, [], begin[None], limits, seed, drawn, clean)
     study.meshes, error = _build_meshes(study.problem_of(0), truth, begin)
     return study, error
 
 
-def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
+def _simulate_clean(problem: Problem, truth: FloatArray) -> Values:
     """Return what data would be without noise."""
     found: Values = {}
     comparisons = compare(Evaluator(problem, truth).divide(2), truth)[1]
@@ -116,7 +116,7 @@ class SimulatedStudy(Study):
     noise : callable, or Values
         The function of the user, or standard deviations.
     clean : Values
-        As of `simulate_clean`.
+        As of `_simulate_clean`.
     """
 
     noise: Any

@@ -114,7 +114,7 @@ class Study:
     def _variation(self) -> float:
         return float(measure_variation(self.problem_of(0)).sum())
 
-    def group_fits(self, runs: range) -> list[tuple[Problem, NDArray[np.intp]]]:
+    def _group_fits(self, runs: range) -> list[tuple[Problem, NDArray[np.intp]]]:
         """Return each problem whose bounds and sample times fits share, with these fits."""
         every = np.arange(len(runs))
         if self.shares_problem:
@@ -137,7 +137,7 @@ class Study:
         # Layers of the mesh move with theta: on the one mesh of a batch, J has steps there that a walk would take for
         # kinks.
         if self.is_finished and not any(mesh.has_layers for mesh in self.meshes):  # J is rough on one mesh
-            pieces = trace_chunk(chunk, self.group_fits(runs), batch)
+            pieces = trace_chunk(chunk, self._group_fits(runs), batch)
         return self.describe_fits(chunk, runs) | {"pieces": pieces}
 
     def _free_kinks(self, chunk: Chunk, runs: range) -> None:
@@ -211,7 +211,7 @@ class Study:
         variation = np.broadcast_to(self.measure_variation(runs), len(runs))
         described = [
             doubts_module.describe_ends(problem, chunk.theta[fits], chunk.cost[fits], variation[fits])
-            for problem, fits in self.group_fits(runs)
+            for problem, fits in self._group_fits(runs)
         ]
         ends = {name: np.concatenate([one[name] for one in described]) for name in described[0]}
         return {**chunk.to_arrays(), **ends, "start": self.list_starts(runs)}

@@ -66,7 +66,7 @@ def judge_study(
     if failed > FORGIVEN_SHARE * R:
         level: Level = "bad" if failed >= HALF * R else "doubtful"
         found.append(Finding(level, build_reason(fits, Doubt("not converged", level, ~ended)), ("see failures",)))
-    distances = measure_distances(fits, shared)
+    distances = _measure_distances(fits, shared)
     elsewhere = distances > ELSEWHERE_FROM
     if elsewhere.any():
         farthest = str(fits.runs[int(np.argmax(distances))])
@@ -106,7 +106,7 @@ def judge_starts(fits: Fits, best: Verdict | None) -> Verdict:
     return best
 
 
-def measure_distances(fits: Fits, considered: NDArray[np.bool_]) -> FloatArray:
+def _measure_distances(fits: Fits, considered: NDArray[np.bool_]) -> FloatArray:
     """Return how far fits converged from the others, in spreads; 0 for those that did not converge: (R,).
 
     An unknown's deviation from the median is measured by the median of these deviations, or by the median standard

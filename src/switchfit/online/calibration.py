@@ -121,7 +121,7 @@ def calibrate(
     phi = as_number(correlation, "correlation")
     if not 0 <= phi < 1:
         raise ValueError(f"correlation must be at least 0 and below 1; got {phi}.")
-    problem = build_quiet_problem(online, length)
+    problem = _build_quiet_problem(online, length)
     theta = problem.initial_theta
     comparisons = compare(Evaluator(problem, theta), theta)[1][0]
     trial = online.build_like(problem, NEVER)
@@ -147,7 +147,7 @@ def calibrate(
     return Calibration(threshold, rate, length, found)
 
 
-def build_quiet_problem(online: Any, length: float) -> Problem:
+def _build_quiet_problem(online: Any, length: float) -> Problem:
     """Return the problem of one run in the present mode, with empty samples at the usual times."""
     problem, now = online.problem, online.now
     run = problem.experiments[0]

@@ -781,7 +781,7 @@ class OnlineEstimator:
         # By how much twice the lowest cost has risen over the last updates is chi-square of as many values, if the
         # model holds.
         jumps, counts = (sum(each) for each in zip(*self._recent, strict=True))
-        if counts and jumps > find_limit(counts):
+        if counts and jumps > _find_limit(counts):
             self._lost = now
         elif is_explained or (self._lost is not None and now - self._lost > self.window):
             self._lost = None
@@ -838,7 +838,7 @@ class OnlineEstimator:
 
 
 @lru_cache
-def find_limit(counts: int) -> float:
+def _find_limit(counts: int) -> float:
     """Return what twice the cost of so many values exceeds with the probability `IMPROBABLE`."""
     return float(special.chdtri(counts, IMPROBABLE))
 

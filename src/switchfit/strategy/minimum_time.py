@@ -48,7 +48,7 @@ def try_shorter_horizons(problem: Problem, fit: Fit) -> Starts:
     end = End(fit.theta, np.inf if fit.violated else fit.cost, 0)
     evaluations, tried, seed = 0, 0, 0
     while True:
-        given = problem if end.failed else shorten_horizon(problem, end.theta)
+        given = problem if end.failed else _shorten_horizon(problem, end.theta)
         found = try_starts(given, end.theta, seed=seed, most=STARTS_UNTIL_FEASIBLE if end.failed else MOST_STARTS)
         evaluations, tried, seed = evaluations + found.end.evaluations, tried + len(found.costs), seed + 1
         lower = not found.end.failed and (end.failed or found.end.cost < end.cost * (1 - SAME_COST))
@@ -58,7 +58,7 @@ def try_shorter_horizons(problem: Problem, fit: Fit) -> Starts:
             return found._replace(end=end._replace(evaluations=evaluations))
 
 
-def shorten_horizon(problem: Problem, theta: FloatArray) -> Problem:
+def _shorten_horizon(problem: Problem, theta: FloatArray) -> Problem:
     """Return the problem with a horizon that ends a little behind the tf of theta (d,), and its guess shrunk to it."""
     run = problem.experiments[0]
     if not isinstance(run.tf, Parameter):

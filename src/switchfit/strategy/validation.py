@@ -189,7 +189,7 @@ class Validation(Displayed):
     @cached_property
     def verdict(self) -> Verdict:
         """Whether the parameters hold for the other run: good, doubtful or bad, and why. Print it for one line."""
-        return judge_validation(self)
+        return _judge_validation(self)
 
     @cached_property
     def predictions(self) -> tuple[Prediction, ...]:
@@ -341,7 +341,7 @@ def _judge_noise(
     return (m - k, 1 - k / m) if m > k else (np.nan, np.nan)
 
 
-def judge_validation(found: Validation) -> Verdict:
+def _judge_validation(found: Validation) -> Verdict:
     """Return the verdict on a validation.
 
     Parameters

@@ -39,7 +39,7 @@ def list_without_effect(fit: Fit) -> tuple[str, ...]:
     return tuple(np.array(fit.theta_names, dtype=object)[flat].tolist())
 
 
-def find_residual_issues(fit: Fit) -> Iterator[Issue]:
+def _find_residual_issues(fit: Fit) -> Iterator[Issue]:
     """Find residuals of a fit that are not white noise of the size of sigma.
 
     Parameters
@@ -77,7 +77,7 @@ def find_issues(fit: Fit) -> Iterator[Issue]:
         yield Issue("not determined", names, {"eigenvalue": smallest})
     yield from _find_missing_errors(fit, smallest)
     if fit.status.successful:
-        yield from find_residual_issues(fit)
+        yield from _find_residual_issues(fit)
         yield from _compare_covariances(fit)
     if not fit.integration_error <= LARGE_INTEGRATION_ERROR:
         yield Issue("large integration error", (fit.integration_error_of,), {"error": fit.integration_error})
