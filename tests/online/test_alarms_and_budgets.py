@@ -107,7 +107,7 @@ def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
         return SimpleNamespace(status=sf.OnlineStatus.TRACKING, statistic=next(drawn))
 
     quiet = SimpleNamespace(reset=lambda: None, update=update)
-    monkeypatch.setattr(sf.OnlineEstimator, "build_like", lambda online, problem, threshold: quiet)
+    monkeypatch.setattr(sf.OnlineEstimator, "_build_like", lambda online, problem, threshold: quiet)
     monkeypatch.setattr(calibration, "list_updates", lambda noisy: [(0.0, {})])
     found = sf.calibrate(sf.OnlineEstimator(problem), 1 / 3600, runs=4000)
     assert found.threshold == pytest.approx(5 + 2 * np.log(3600), abs=0.5)  # 1.8 more without the factor

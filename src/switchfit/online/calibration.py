@@ -113,7 +113,7 @@ def calibrate(
     >>> len(found.maxima)
     10
     """
-    if not hasattr(online, "build_like"):
+    if not hasattr(online, "_build_like"):
         raise TypeError(f"online must be an sf.OnlineEstimator; got {shorten(online)}.")
     rate, length = as_positive(false_alarms, "false_alarms"), as_positive(seconds, "seconds")
     if as_count(runs, "runs") < 10:
@@ -124,7 +124,7 @@ def calibrate(
     problem = _build_quiet_problem(online, length)
     theta = problem.initial_theta
     comparisons = compare(Evaluator(problem, theta), theta)[1][0]
-    trial = online.build_like(problem, NEVER)
+    trial = online._build_like(problem, NEVER)
     rng, maxima = np.random.default_rng(seed), []
     for _ in range(runs):
         trial.reset()

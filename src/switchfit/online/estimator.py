@@ -220,19 +220,8 @@ class OnlineEstimator:
         own = np.r_[tuple(self._slices[name] for name in chosen)]
         return np.flatnonzero(self._beam.into[:, own].any(axis=1))
 
-    def build_like(self, problem: Problem, threshold: float) -> OnlineEstimator:
-        """Return an estimator of another problem with the same settings, without a budget.
-
-        See Also
-        --------
-        calibrate
-
-        Examples
-        --------
-        >>> online = sf.OnlineEstimator(heater_problem())
-        >>> online.build_like(online.problem, threshold=20.0).threshold
-        20.0
-        """
+    def _build_like(self, problem: Problem, threshold: float) -> OnlineEstimator:
+        """Return an estimator of another problem with the same settings, without a budget: for `calibrate`."""
         return OnlineEstimator(problem, **self._given_settings, threshold=threshold)
 
     def set_threshold(self, threshold: float) -> None:

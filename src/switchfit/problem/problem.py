@@ -182,7 +182,7 @@ class Problem:
         self._set_experiments(experiments)
         # An initial state that is a function of p has a length only now that it is traced.
         for structure in self.structures:
-            self.system.check_labels_of(structure.n)
+            self.system._check_labels_of(structure.n)
         if not self.max_transitions:
             require_unknowns(self)
         self._check_noise()

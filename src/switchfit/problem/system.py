@@ -107,24 +107,14 @@ class HybridSystem:
         for label in ("state_names", "state_units"):
             set_fields(self, **{label: as_labels(getattr(self, label), label, "state")})
         if not callable(self.initial_state):
-            self.check_labels_of(len(self.initial_state))
+            self._check_labels_of(len(self.initial_state))
 
     def __reduce__(self) -> tuple[type, tuple[object, ...]]:
         """How it is copied and pickled: built again, from dicts, since a mappingproxy cannot be pickled."""
         return type(self), tuple(dict(v) if isinstance(v, Mapping) else v for v in vars(self).values())
 
-    def check_labels_of(self, n: int) -> None:
-        """Raise ValueError unless names and units, if given, have one entry for each of n states.
-
-        See Also
-        --------
-        HybridSystem
-
-        Examples
-        --------
-        >>> system = sf.HybridSystem({"rest": lambda t, x, p: 0 * x}, lambda p: p["x0"], state_names=("x", "y"))
-        >>> system.check_labels_of(2)
-        """
+    def _check_labels_of(self, n: int) -> None:
+        """Raise ValueError unless names and units, if given, have one entry for each of n states."""
         for label in ("state_names", "state_units"):
             as_labels(getattr(self, label), label, "state", n)
 
