@@ -69,14 +69,17 @@ def read_contents(function: object) -> Hashable | None:
 
 def _read(value: Any) -> Hashable:
     kind = type(value)
+    # The type counts: 1, 1.0 and True are equal in Python, and are different constants of a trace.
     if kind in PLAIN_TYPES:
         return kind, repr(value) if kind in (float, complex) else value  # -0.0 is not 0.0, nan is nan
     if kind is np.ndarray or isinstance(value, (np.generic, jax.Array)):
         return _read_array(value)
     if kind in (tuple, list):
         return kind, tuple(map(_read, value))
+    # In its order: a function may iterate over it.
     if kind in (dict, types.MappingProxyType):
         return dict, _read(list(value.items()))
+    # How the built-in models bind their constants to their modes.
     if kind is functools.partial:
         return kind, _read((value.func, value.args, value.keywords))
     if _is_trusted(value):
@@ -87,6 +90,7 @@ def _read(value: Any) -> Hashable:
 
 
 def _read_array(value: Any) -> Hashable:
+    # A function made inside another trace has no value yet; arrays of objects may hold anything.
     if is_tracer(value) or value.dtype.hasobject:
         raise NotPlain
     array = np.asarray(value)
@@ -103,12 +107,15 @@ def _read_function(function: types.FunctionType) -> Hashable:
         cells = [cell.cell_contents for cell in function.__closure__ or ()]
     except ValueError as error:  # a cell that is still empty
         raise NotPlain from error
+    # A global is looked up when the function runs, so that its value of today counts. A name that is neither a global
+    # nor a builtin raises NameError when it is traced, and not here.
     found = {}
     for name in names:
         if name in scope:
             found[name] = scope[name]
         elif name in OPAQUE_BUILTINS or not hasattr(builtins, name):
             raise NotPlain
+    # The code object compares bytecode, names and constants: equal for two runs of one cell of a notebook.
     return function.__code__, _read((function.__defaults__, function.__kwdefaults__, cells, found))
 
 
@@ -119,6 +126,7 @@ def _is_trusted(value: Any) -> bool:
     if not isinstance(value, (type, *LIBRARY_FUNCTION_TYPES)):
         return False
     modules = {getattr(value, "__module__", None) or ""} - {"builtins"}
+    # `[].append` is a builtin whose list may change; `math.sin` belongs to its module.
     if isinstance(value, types.BuiltinFunctionType) and not isinstance(value.__self__, types.ModuleType | None):
         return False  # a method of an object
     if isinstance(value, types.FunctionType):
@@ -142,6 +150,8 @@ def _list_globals(code: types.CodeType) -> tuple[str, ...] | None:
         pending += [constant for constant in each.co_consts if isinstance(constant, types.CodeType)]
         for instruction in dis.get_instructions(each):
             name, argument = instruction.opname, instruction.argval
+            # Attributes of what is loaded need no look: of trusted modules they do not change, and other modules are
+            # not plain.
             if name in ("LOAD_GLOBAL", "LOAD_NAME"):
                 names.add(argument)
             elif (

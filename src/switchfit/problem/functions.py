@@ -86,6 +86,8 @@ class Function:
         self.structs = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in closed.in_avals]
         content = describe_jaxpr(closed)
         self.digest = hashlib.sha256("\n".join([repr(parameters), *content.lines]).encode()).hexdigest()
+        # Objects without text, such as a callback: two of them are equal if they are one object. While this function
+        # holds it, no other object can get its id.
         self._opaque = tuple(content.opaque)  # compared by identity, therefore kept alive
         self._key = (self.digest, tuple(map(id, self._opaque)))
 
@@ -174,14 +176,21 @@ def trace_function(call: Call, parameters: Mapping[str, Shape]) -> Function:
         If it raises, returns another shape or dtype, or computes in less than double precision.
     """
     function = call.function
+    # JAX caches the trace of a jitted function by its identity: a global that it reads could change unseen.
     while type(function) is JITTED and hasattr(function, "__wrapped__"):  # JAX would not trace it again
         function = function.__wrapped__
+    # The cache. Contents are compared by value, since problems are built again and again of functions that are made
+    # anew each time, in a loop, a notebook's cell or a worker process: compared by identity, each would be traced (some
+    # ten milliseconds) and none would find its compiled program (seconds). A function that reads what cannot be
+    # compared is traced every time: retracing is the price of never using an outdated one.
     content = read_contents(function)
     asked = (call.arguments, call.shape, call.inputs, tuple(parameters.items()))
     key = None if content is None else (content, asked)
     if (found := _traces.get(key)) is not None:
         return found
     call = call._replace(function=function)
+    # Inside, JAX reuses its own traces of jitted functions that are called, and these may read what has changed: a new
+    # value of `_retracing` forbids it where the content is unknown.
     with use_float64(), nullcontext() if key is not None else _retracing(next(_turn)):
         traced = _trace(call, parameters)
     if key is not None:
@@ -199,6 +208,8 @@ def _trace(call: Call, parameters: Mapping[str, Shape]) -> Function:
     def evaluate(*given: Array) -> Array:
         flat: list[Traced] = list(given[:count])
         if call.inputs:
+            # The jaxpr takes the input as an array: a dict would be flattened in the order of its keys, and runs whose
+            # inputs are named in different orders would not share a program.
             flat[-1] = {name: flat[-1][k] for k, name in enumerate(call.inputs)}
         named = dict(zip(parameters, given[count:], strict=True))
         return call_for_vector(call, (*flat[:position], named, *flat[position:]))
@@ -206,6 +217,8 @@ def _trace(call: Call, parameters: Mapping[str, Shape]) -> Function:
     shapes = [*(size for size in call.arguments if size is not None), *parameters.values()]
     closed = jax.make_jaxpr(evaluate)(*(jax.ShapeDtypeStruct(size, jnp.float64) for size in shapes))
     refuse_wrong_constants(closed, call.what)
+    # t, x and u stay, also where they are not read: callers pass them by position. Parameters that are not read go, so
+    # that the derivatives of a run cost what its own parameters cost.
     is_kept = [True] * count + [False] * len(parameters)
     jaxpr, is_read = drop_unused(closed.jaxpr, is_kept)
     for each in list_jaxprs(jaxpr):
@@ -220,6 +233,7 @@ def _trace(call: Call, parameters: Mapping[str, Shape]) -> Function:
 def _call_while_tracing(call: Call, arguments: tuple[Traced, ...]) -> Array:
     """Call a user's function while tracing; turn any exception into one sentence that names the function."""
     function, what, form = call.function, call.what, call.form
+    # Before the call: a TypeError from inside the function looks the same as one from its call.
     misfit = find_misfit(function, arguments)
     if misfit is not None:
         inputs = " Modes get an input u if and only if the experiment has inputs." if what.startswith("mode ") else ""
@@ -256,6 +270,7 @@ def call_for_vector(call: Call, arguments: tuple[Traced, ...]) -> Array:
     """Return the result of a user's function, checked (while tracing) to be a float64 array of the required shape."""
     array, shape, what, form = _call_while_tracing(call, arguments), call.shape, call.what, call.form
     if shape is not None and array.shape != shape:
+        # A state of one number may be returned as a number, and a cost as an array of one.
         if not array.size == int(np.prod(shape)) == 1:
             raise ValueError(f"{what}: {form} must return an array of shape {shape}; got shape {array.shape}.")
         array = array.reshape(shape)

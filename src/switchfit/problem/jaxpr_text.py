@@ -32,6 +32,7 @@ def describe_jaxpr(closed: ClosedJaxpr) -> _Text:
     text = _Text(closed)
     if text.has_rules:
         try:
+            # Two functions with equal values and other rules for their derivatives are different functions for a fit.
             text.lines += _Text(_differentiate_twice(closed)).lines
         except TypeError:  # functions with reverse-mode rules only have no forward derivative
             text.opaque.append(object())
@@ -61,6 +62,8 @@ class _Text:
 
     def add(self, jaxpr: Jaxpr, consts: Sequence[Traced]) -> None:
         """Describe a jaxpr."""
+        # Numbers of variables in the order in which they are met, as JAX's own names of them count on in a process: the
+        # text, and the digest made of it, are the same in every process.
         number: dict[Atom, int] = {}
 
         def atom(a: Atom) -> str:
@@ -74,6 +77,7 @@ class _Text:
             made = " ".join(f"{atom(v)}:{v.aval.str_short()}" for v in equation.outvars)
             self.lines.append(f"{made} = {equation.primitive.name} {given}")
             self.has_rules = self.has_rules or equation.primitive.name.startswith("custom_")
+            # Sorted: the order of a dict's entries is that of JAX's source, which another version may have changed.
             for name, value in sorted(equation.params.items()):
                 if name not in UNCOMPARED_PARAMETERS:
                     self._parameter(name, value)
@@ -90,6 +94,7 @@ class _Text:
             self.lines.append(f"{name}={self._array(value)}")
         else:
             text = repr(value)
+            # An address in the text would be another in each process, and may be that of another object later on.
             if " at 0x" in text or (callable(value) and not isinstance(value, type)):
                 text = f"object {len(self.opaque)}"
                 self.opaque.append(value)
@@ -97,5 +102,7 @@ class _Text:
 
     def _array(self, value: Traced) -> str:
         array = np.asarray(value)
+        # A digest and not the numbers: a function may hold a table of a million. The dtype and the shape belong to it,
+        # as bytes alone do not tell one array from another of the same bytes.
         digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16).hexdigest()
         return f"{array.dtype}{list(array.shape)}{digest}"

@@ -98,6 +98,7 @@ class Walk(Generic[V]):
         self, jaxpr: Jaxpr, consts: Sequence[Traced], given: Sequence[V], origin: Equation | None = None
     ) -> list[V]:
         """Return the results of a jaxpr."""
+        # Values by their variables, of this jaxpr alone: a jaxpr that is called has variables of its own (`enter`).
         known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(self.constant, consts), *given], strict=True))
 
         def value(atom: Atom) -> V:
@@ -114,6 +115,7 @@ class Walk(Generic[V]):
         JAX traces its own functions once for all callers: what is inside them has the place of the call.
         """
         jaxpr, consts = strip_constants(inner), getattr(inner, "consts", ())
+        # Once inside a function of JAX, all deeper ones belong to the call in the user's code.
         is_of_jax = origin is not equation or find_public_name(jaxpr) is not None
         return self.run(jaxpr, consts, given, origin if is_of_jax else None)
 
@@ -127,6 +129,7 @@ def find_read_entries(jaxpr: Jaxpr, variables: Sequence[Atom]) -> list[tuple[int
     jaxpr : jaxpr
     variables : sequence of its arguments
     """
+    # Which entries of which argument a variable holds; a variable that is no plain selection of one holds none.
     held: dict[Atom, tuple[int, IntArray]] = {}
     for k, v in enumerate(variables):
         held[v] = k, np.arange(array_type(v).size).reshape(array_type(v).shape)
@@ -139,6 +142,9 @@ def find_read_entries(jaxpr: Jaxpr, variables: Sequence[Atom]) -> list[tuple[int
             if name in SELECTIONS:
                 held[made[0]] = k, SELECTIONS[name](entries, settings)
             else:
+                # Anything but a selection reads all that it gets, a call of a function too: more may be found than is
+                # read, never less. What is found too much costs a derivative that is zero; too little would be a wrong
+                # gradient.
                 read[k].update(entries.ravel().tolist())
     return [tuple(sorted(positions)) for positions in read]
 
@@ -168,6 +174,7 @@ def find_public_name(jaxpr: Jaxpr | ClosedJaxpr) -> str | None:
     name = name.lstrip("_")
     if file is None or not file.startswith(os.path.dirname(jax.__file__) + os.sep):
         return None
+    # Users know `jnp.linalg.norm`, and not the private function that implements it and stands in the trace.
     for module in PUBLIC:
         if hasattr(import_module(module), name):
             return f"{module.replace('jax.numpy', 'jnp')}.{name}"

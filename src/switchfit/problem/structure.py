@@ -105,6 +105,8 @@ class Structure:
     @property
     def functions(self) -> Structure:
         """The same with one segment, for programs that work in one mode at a time."""
+        # What is compiled for one mode at a time, as the search for step sizes, must not be compiled again because a
+        # transition elsewhere has another reset map.
         alone = replace(self, reset_library=(), guard_library=(), transition_cost_library=()).library
         return replace(alone, mode_of_segment=(0,), terminal_constraints=(), transitions=0, known=0)
 
@@ -143,6 +145,8 @@ class Structure:
         """Return the side of each transition time at a node: `side` (), or an array (N,) with +1 for the jumps."""
         if not self.jumps:
             return side
+        # At a jump the sample belongs to the state before it, whatever side is asked for: its time is no unknown, and
+        # has no derivative.
         return xp.where(np.isin(np.arange(self.N), self.jumps), 1.0, side)
 
     @property
@@ -175,6 +179,7 @@ class Structure:
     @property
     def acting(self) -> dict[str, Function]:
         """The functions that act in its own sequence, by their roles: all but the modes that do not occur in it."""
+        # A mode of the library that does not occur in the sequence: what it reads or compares with does not act on J.
         idle = {f"mode {name!r}" for k, name in enumerate(self.mode_names) if k not in self.mode_of_segment}
         return {role: function for role, function in self.roles.items() if role not in idle}
 

@@ -82,6 +82,7 @@ class _Constants(Walk[Known]):
         inner = find_inner_jaxprs(equation)
         results: Sequence[Known] = [None] * len(equation.outvars)
         for jaxpr in inner:
+            # Known numbers are followed into plain calls alone: an index in a loop is another in each pass.
             if equation.primitive.name == "jit":  # a plain call; loops and branches without known arguments
                 results = self.enter(equation, jaxpr, given, origin)
             else:
@@ -96,6 +97,7 @@ class _Constants(Walk[Known]):
     def _evaluate(self, equation: Equation, given: list[Known]) -> Sequence[Known]:
         """Return the results of an operation of known numbers that may make an index."""
         fold, kind = FOLDED.get(equation.primitive.name), getattr(array_type(equation.outvars[0]).dtype, "kind", "O")
+        # Indices are integers: nothing else needs to be known, and arrays of the user may be large.
         if fold is None or kind not in "iub":
             return [None] * len(equation.outvars)
         return [fold(*given, **equation.params)]
@@ -116,6 +118,7 @@ class _Constants(Walk[Known]):
         for start, axis, size in _list_indices(equation, given):
             shape = array_type(equation.invars[0]).shape
             n, starts = shape[axis], np.ravel(start)
+            # A slice that reaches beyond the end is moved back by JAX without a word, an index beyond it is clipped.
             wrong = starts[(starts < 0) | (starts > n - size)]
             if wrong.size:
                 index = int(wrong[0]) - (n if wrong[0] < 0 else 0)  # JAX has added n to a negative index
@@ -136,9 +139,12 @@ def _list_indices(equation: Equation, given: list[Known]) -> Iterator[tuple[Know
     name, params = equation.primitive.name, equation.params
     found: Iterable[tuple[Known, int, int]] = ()
     if name == "dynamic_slice":
+        # The start of a slice on each axis: what ``x[i]`` with a constant i becomes.
         found = zip(given[1:], count(), params["slice_sizes"], strict=False)
     elif name == "dynamic_update_slice":
         found = zip(given[2:], count(), array_type(equation.invars[1]).shape, strict=False)
+    # Several indices at once, ``x[np.array([0, 2])]``. Only where the mode promises that they are in range: with
+    # ``mode="fill"`` or "clip" the user has said what is to happen.
     elif name == "gather" and params["mode"] is PROMISED and given[1] is not None:
         axes = params["dimension_numbers"].start_index_map
         found = ((np.asarray(given[1])[..., k], axis, params["slice_sizes"][axis]) for k, axis in enumerate(axes))
@@ -152,6 +158,7 @@ def _is_update(equation: Equation) -> bool:
     """Return whether a scatter is an update of the user, ``x.at[index].set(value)``, and not one by JAX, as derivatives
     of ``x.at[index].get(mode="fill")`` are.
     """
+    # The function of JAX that the user's code called: the innermost frame whose caller is the user's.
     calls = pairwise(list_calls(equation))
     found = next((inner for inner, outer in calls if is_user_file(outer.co_filename)), None)
     return found is not None and found.co_qualname.startswith(WRITER) and found.co_name != "get"

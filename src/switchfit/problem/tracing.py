@@ -67,10 +67,14 @@ class _Tracer:
     ) -> Function:
         """Trace a function, given what a `Call` consists of."""
         call = Call(function, arguments, shape, what, form, inputs)
+        # By identity, before `trace_function` compares contents, which takes longer: the functions live as long as the
+        # system and the data of this problem, so that no other can have their ids meanwhile. Shapes of parameters
+        # count, as a map may give a name another parameter.
         key = (id(call.function), call[1:], self._key)
         traced = self._traced.get(key)
         if traced is None:
             traced = self._traced[key] = trace_function(call, self.shapes)
+        # What is read is noted also where the trace was found: it belongs to this experiment, as the cache does not.
         for name, entries in traced.read.items():
             self.read.setdefault(name, set()).update(entries)
         return traced
@@ -89,6 +93,8 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
         With the name of the mode or function, what it should return and what it returned.
     """
     trace, system = _Tracer(sources, experiment), sources.system
+    # A library has all modes, so that every sequence of them shares one program; without one, a mode that does not
+    # occur is not traced, and may need parameters that the problem lacks.
     used = system.modes if transitions is not None else set(experiment.mode_sequence)
     names = tuple(name for name in system.modes if name in used)  # in the same order for every sequence
     x0, n, unknown = _trace_initial_state(trace, initial_state_of(system, experiment))
@@ -108,6 +114,7 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
         given: AtTransitions, shape: Shape, what: str, form: str, at_jumps: Sequence[Function | None] = ()
     ) -> tuple[tuple[Function | None, ...], tuple[Function, ...]]:
         """Return the function of each transition and jump, None for one without, and those of all possible ones."""
+        # Of a library all functions, else those between the modes of this sequence.
         here = given if transitions is not None else own
         traced = {pair: trace(g, at, shape, f"{what} {pair}", form) for pair, g in given.items() if pair in here}
         of_transitions = [traced.get(pair) if pair else None for pair in own]
@@ -122,7 +129,9 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
         names = (*names, REST)
     after_jumps = (own_modes[i] for i in experiment.passed_by_jumps)  # the mode before it
     sequence = (own_modes[0], *insert_jumps(experiment, own_modes[1:], after_jumps))
+    # A jump is a transition from a mode to itself at a known time, with the jump's map as its reset map.
     jump_maps = [trace(jump, at, (n,), "the map of a Jump", "map(t, x, p)") for _, jump in experiment.acts]
+    # The order of the outputs: reference signals first, then the Measurements (`Structure.outputs`).
     references = ((item, item.signal.channels) for item in experiment.references)
     reset_maps, reset_library = at_transitions(system.reset_maps, (n,), "reset map", "R(t, x, p)", jump_maps)
     guards, guard_library = at_transitions(system.guards, (), "guard", "g(t, x, p)")
@@ -154,6 +163,7 @@ def trace_structure(sources: Sources, experiment: Experiment, transitions: int |
         jumps=tuple(np.flatnonzero(experiment.is_jump).tolist()),
         has_free_tf=experiment.has_free_tf,
     )
+    # Last, since only now all functions have been traced and it is known what they read.
     return replace(structure, parameters=_select_parameters(trace, structure))
 
 

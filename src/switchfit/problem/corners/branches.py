@@ -57,6 +57,7 @@ class Corners:
     def __init__(self, function: Function, margins: Margins = ()) -> None:
         self.function, self.margins = function, margins
         walks = [CornerWalk(())]
+        # Smooth modes, the common case, are not walked through: only their primitives are looked at.
         if has_corners(function.jaxpr):
             with use_float64():
                 jax.eval_shape(lambda *given: walks.append(self._run(None, given)[0]), *function.structs)
@@ -64,6 +65,8 @@ class Corners:
         # Corners are the same where they compare the same two numbers, in either order.
         known: dict[tuple[int, ...], int] = {}
         self._group = [known.setdefault(tuple(sorted(pair)), len(known)) for pair in pairs]
+        # Case: ``where(x > y, ...)`` and ``maximum(y, x)`` in one mode. Both change at x = y; as two corners they
+        # would be met at one time, and have sides that no state is on: above one and below the other.
         firsts = [self._group.index(k) for k in range(len(known))]
         self._orientation = [1 if pair == pairs[firsts[k]] else -1 for pair, k in zip(pairs, self._group, strict=True)]
         self.count = len(known)
@@ -127,6 +130,7 @@ class Corners:
         return self._derive(("end", which), sides, lambda *given: self._ends(sides, given)[which])
 
     def _derive(self, what: Hashable, sides: Sides, evaluate: Callable[..., Traced]) -> Function:
+        # Each is a `Function`, traced once and compared by content, so that compiled programs find it by its digest.
         key = what, sides
         if key not in self._derived:
             with use_float64():
@@ -143,6 +147,8 @@ class Corners:
     def _evaluate(self, sides: Sides, given: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return f (n,), and g of each corner."""
         # Members of a group compare the same two numbers, maybe in the other order: `o` is -1 then.
+        # Case: play, ``maximum(x - c, 0) - maximum(-x - c, 0)``; a member of a group whose order is reversed has the
+        # other side of the same surface.
         members = [o * sides[g] for g, o in zip(self._group, self._orientation, strict=True)]
         t, x, *others = given
         own = [others[0][0], *others[1:]] if self.function.takes_input else others  # of u and du/dt, the mode takes u
@@ -157,12 +163,16 @@ class Corners:
         # dg_i/dt is linear in f, so that dg/dt = 0 along f_0 + sum_k s_k (f_k - f_0) is A s = -rate_0 with
         # A_ij = rate_j,i - rate_0,i.
         rate = [self._rates(_settle(sides), field, given)[jnp.array(sliding)] for field in (f, *others)]
+        # Friction on a body that sticks: one corner, and A is a number. Two relays at once, as the axles of a vehicle
+        # that both stick, are coupled by its mass: a system of two.
         A = [[rate[1 + j][i] - rate[0][i] for j in range(len(sliding))] for i in range(len(sliding))]
         s = _solve(A, [-rate[0][i] for i in range(len(sliding))])
         return f + sum(each * (other - f) for each, other in zip(s, others, strict=True)), s
 
     def _slide(self, sides: Sides, given: Sequence[Array]) -> tuple[list[int], list[Array]]:
         """Return the sliding corners; f_0 with side -1 at all of them, and f_k with side +1 at one of them alone."""
+        # Sliding along all corners with side 0. The fields with one of them at +1 span the combination (Filippov);
+        # those with several at +1 are not needed while it is linear in each s.
         sliding, base = [k for k, side in enumerate(sides) if side == 0], _settle(sides)
         every = base, *((*base[:k], 1, *base[k + 1 :]) for k in sliding)
         return sliding, [self._guard(each).evaluate(given) for each in every]
@@ -186,6 +196,9 @@ class Corners:
         """Return the mode with these sides, at steep corners no nearer than their margins: traced once for all uses."""
 
         def evaluate(t: Array, x: Array, *others: Array) -> Array:
+            # Steep corner, as of a tank that runs dry, ``sqrt(maximum(h, 0))``: its slope is infinite at h = 0, where
+            # the last stages of a row stand. There the field of the wet side is that at h = margin, whose slopes are
+            # finite.
             for (k, side), margin in self.margins:
                 if sides[k] == side:
                     is_near = side * self.surfaces(sides).evaluate([t, x, *others])[k] < margin
@@ -198,6 +211,7 @@ class Corners:
         """Return the state nearest to x at which g of a corner is the target, to first order in g: (n,)."""
         t, x, *others = given
         g, gradient = jax.value_and_grad(lambda x: self.surfaces(sides).evaluate([t, x, *others])[corner])(x)
+        # A surface whose gradient is 0 here, as x**2 = 0 has: there is no nearest point to first order, and x stays.
         square = jnp.sum(gradient**2)
         return x - (g - target) * gradient / jnp.where(square > 0, square, 1.0)
 
@@ -209,6 +223,8 @@ class Corners:
             u, *others = others
             moving, rates = [*moving, u], [*rates, jnp.stack([u[1], jnp.zeros_like(u[1])])]
         # The derivative of g along (1, f, du/dt): one forward pass.
+        # Of the input, the second row is its rate du/dt, which does not move along itself: cubic inputs bend inside a
+        # row, but dg/dt is asked for at one time.
         surfaces = lambda *moving: self.surfaces(sides).evaluate([*moving, *others])  # noqa: E731
         return jax.jvp(surfaces, moving, rates)[1]
 
@@ -217,6 +233,7 @@ class Corners:
         s = iter(self._field(sides, given)[1])
         # Of a corner with a side: side g, positive inside. Of a sliding one: s and 1 - s, the limits of the convex
         # combination.
+        # A sliding corner has two ends, one for each side on which it may be left. Their order is that of `list_ends`.
         ends = [[side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides)]
         return [value for each in ends for value in each]
 
@@ -224,6 +241,8 @@ class Corners:
         """Return the function on the sides on which x is: others are evaluated where they are defined, and left out."""
         g, chosen = self._evaluate((1,) * self.count, [t, x, *others])[1], jnp.zeros(self.function.shape)
         for sides in product((1, -1), repeat=self.count):
+            # All branches are evaluated, as JAX has no branch under `vmap`; those that are not chosen must be finite.
+            # So each is evaluated at the nearest point of its own sides, a little inside.
             is_here, there = jnp.array(True), x
             for k, side in enumerate(sides):
                 is_inside, target = side * g[k] > 0, side * (abs(g[k]) + TOUCHED)
@@ -238,6 +257,8 @@ def _settle(sides: Sides) -> Sides:
     return tuple(side or -1 for side in sides)
 
 
+# By hand and not by `jnp.linalg.solve`: machine code compiles straight-line operations, and few corners slide
+# at once.
 def _solve(A: list[list[Array]], b: list[Array]) -> list[Array]:
     """Solve linear equations by elimination, without pivoting: A_kk < 0 where corner k attracts from both sides."""
     (pivot, *right), *rest = A

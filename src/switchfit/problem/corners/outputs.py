@@ -22,8 +22,12 @@ def choose_sides(function: Function) -> Function:
 
     Those of ``sqrt(maximum(x, 0))`` are NaN for x < 0, where an infinite slope is multiplied by 0.
     """
+    # Without an operation of infinite slope the derivative of the case left out is finite, and 0 times it is 0: the
+    # function is right as it is, and shorter.
     names = {equation.primitive.name for each in list_jaxprs(function.jaxpr) for equation in each.eqns}
     corners = find_corners(function) if names & STEEP_PRIMITIVES else None
+    # 2**count branches are evaluated for every sample; with many corners the function is left as it is, and
+    # `finiteness` names the operation if a derivative is NaN.
     if corners is None or not 0 < corners.count <= MOST_CHOSEN:
         return function
     with use_float64():

@@ -38,12 +38,15 @@ class _Timed(Walk[Array | None]):
 
     def apply(self, equation: Equation, given: list[Traced], origin: Equation) -> Sequence[Traced]:
         name, params = equation.primitive.name, equation.params
+        # Of the branches of a `cond` all are looked at: which of them runs may depend on the state, which is unknown
+        # here.
         is_search, inner = params.get("name") == "searchsorted", params.get("jaxpr", params.get("call_jaxpr"))
         if name == "cond":
             for branch in params["branches"]:
                 self.enter(equation, branch, given[1:], origin)
         elif inner is not None and name not in NO_CALLS and not is_search:
             return self.enter(equation, inner, given, origin)
+        # An operand that follows from the state makes the result unknown; so does a callback, which may read anything.
         if any(value is None for value in given) or name.endswith("callback"):
             return [None] * len(equation.outvars)
         if is_search and np.shape(given[0]) <= (MOST_KNOTS,):
@@ -51,7 +54,10 @@ class _Timed(Walk[Array | None]):
         elif name in CORNER_PRIMITIVES and array_type(equation.invars[-1]).dtype == np.float64:
             a, *others = given[1:2] + given[::2] if name == "clamp" else given
             gaps = [a - b for b in others or [0.0]]
+            # ``floor(t)`` jumps where sin(pi t) = 0: one function for all integers.
             gaps = [jnp.sin(np.pi * (a + ROUNDED[name][0]))] if name in ROUNDED else gaps
+            # A field is continuous at a bend, as of ``clip(u, -2, 2)``, and not at a jump, as of ``t > 3``: who makes
+            # the nodes has to tell the two apart.
             self.gaps[name not in ("max", "min", "clamp", "abs")].extend(gaps)
         return evaluate(equation, given)
 
@@ -72,5 +78,7 @@ def compile_timed_corners(function: Function, known: tuple[str, ...]) -> Callabl
         return None
     structs = dict(zip(function.parameters[::-1], function.structs[::-1], strict=False))
     with use_float64():
+        # Shapes alone, without compiling: most functions with a comparison have it with the state, and need nothing
+        # here.
         found = jax.eval_shape(evaluate, function.structs[0], function.structs[2:3], [structs[name] for name in known])
     return jax.jit(jax.vmap(evaluate, in_axes=(0, 0, None))) if any(each.size for each in found) else None

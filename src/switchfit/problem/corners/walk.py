@@ -98,6 +98,8 @@ class CornerWalk(Walk[_Value]):
         entries = (("constant", str(array.dtype), entry) for entry in array.ravel().tolist())
         return _Value(array, False, self._list_names(array.shape, entries))
 
+    # Names are found once, by the walk that looks for the corners. Walks that evaluate know the sides of each of them,
+    # and need no names.
     def _list_names(self, shape: tuple[int, ...], keys: Iterable[Hashable]) -> Names:
         """Return an array of numbers, the same for the same key; only where the corners are looked for."""
         if self._sides is not None:
@@ -111,6 +113,8 @@ class CornerWalk(Walk[_Value]):
         name, params, names = equation.primitive.name, equation.params, [each.names for each in given]
         if self._sides is not None:
             return [NO_NAME] * len(equation.outvars)
+        # An entry keeps its name as it is moved: `x[0]` of a slice is `x[0]`. Else relu(x)[0] and maximum(x[0], 0)
+        # would be two corners at one place, met at one time.
         if name in SELECTIONS:
             return [SELECTIONS[name](names[0], params)]
         if name in ("broadcast_in_dim", "concatenate"):
@@ -120,6 +124,7 @@ class CornerWalk(Walk[_Value]):
             every = np.broadcast_arrays(*names)
             operands = zip(*(each.ravel().tolist() for each in every), strict=True)
             return [self._list_names(every[0].shape, ((what, own) for own in operands))]
+        # A result that mixes entries, as a sum does: its name is that of the operation and of all entries it takes.
         whole = tuple((each.shape, *each.ravel().tolist()) for each in names)
         outs = enumerate(array_type(out).shape for out in equation.outvars)
         return [self._list_names(shape, ((what, whole, i, k) for k in count())) for i, shape in outs]
@@ -128,9 +133,12 @@ class CornerWalk(Walk[_Value]):
         """Return the results of an operation on the given sides, and note the corners that it makes."""
         name, params, names = equation.primitive.name, equation.params, self._name(equation, given)
         depends = [each.moves for each in given]
+        # A vector: its entries may lie on different sides, as the four wheels of a vehicle do of the slip at which they
+        # let go. Longer ones, as of a discretized rod, would make too many sides to be followed: they stay whole.
         is_array = 1 < max((np.size(_get_array(each.value)) for each in given), default=1) <= MOST_ENTRIES
         if is_array and any(depends) and name in BY_ENTRY:
             return [_Value(self._apply_by_entry(equation, given, origin), True, names[0])]
+        # What follows takes vectors that have been split: it moves the entries, or puts them together again.
         is_split = any(isinstance(each.value, _Entries) for each in given)
         if is_split and name in SELECTIONS:
             found = SELECTIONS[name](given[0].value.array, params)
@@ -140,6 +148,7 @@ class CornerWalk(Walk[_Value]):
         moving = [each._replace(moves=own) for each, own in zip(given, moves, strict=True)]
         joined = [each._replace(value=join_entries(each.value)) for each in moving]
         values = [each.value for each in joined]
+        # First what the sides decide: an operation with a corner, a table, a choice.
         made = self._evaluate(equation, joined, origin)
         if made is None and name == "cond" and isinstance(values[0], np.ndarray):
             chosen = int(np.clip(values[0], 0, len(params["branches"]) - 1))
@@ -150,6 +159,7 @@ class CornerWalk(Walk[_Value]):
                 if k == chosen or has_corners(branch)
             }
             return [each._replace(names=own) for each, own in zip(results[chosen], names, strict=True)]
+        # Then calls. A loop, `scan` or `while`, is evaluated as it is: corners inside it are not found.
         is_call = made is None and name not in ("scan", "while")
         inner = params.get("jaxpr", params.get("call_jaxpr")) if is_call else None
         # Functions inside are walked through where they have corners or are decided by one; else they are bound as they
@@ -198,6 +208,9 @@ class CornerWalk(Walk[_Value]):
         shape = np.broadcast_shapes(*(np.shape(each.value) for each in given))
         given = [each._replace(value=_broadcast(each.value, shape)) for each in given]
         if name in ROUNDED:
+            # A gear or an encoder, ``floor(x)``: it jumps at every integer, and sides are two. The parity of the
+            # integer below is such a side: on either, the trajectory is between two jumps, and the branch is a
+            # constant.
             shift, more = ROUNDED[name]
             operands, v = given[0].names.ravel().tolist(), given[0].value + shift
             names = self._list_names(shape, (("sine", shift, own) for own in operands))
@@ -206,11 +219,14 @@ class CornerWalk(Walk[_Value]):
             odd, even = 2.0 * jnp.floor((v - 0.5) / 2.0) + 1.0, 2.0 * jnp.floor((v + 0.5) / 2.0)
             return _choose(is_even, odd, even) + more
         if name == "clamp":  # of the lowest value, the state, and the highest
+            # A limit, ``clip(x, -1, 1)``: one corner at each end.
             low, x, high = given
             above, below = self._meet(x, low, origin), self._meet(x, high, origin)
             return _choose(above, low.value, _choose(below, x.value, high.value))
         one, other = given if len(given) > 1 else (given[0], self.constant(np.zeros(())))
         is_above, a, b = self._meet(one, other, origin), one.value, other.value
+        # A relay or dry friction: ``sign`` is never 0 here, since a trajectory that stays at the corner slides, with
+        # side 0.
         if name == "sign":
             return np.where(is_above, 1.0, -1.0)
         if name == "abs":
@@ -227,6 +243,8 @@ class CornerWalk(Walk[_Value]):
         self.values += [(a.reshape(-1)[k], b.reshape(-1)[k]) for k in range(size)]
         self.pairs += zip(*names, strict=True)
         self.lines += [find_line(origin)] * size
+        # Corners are numbered in the order in which the walk meets them, which is the same for all sides: the k-th of
+        # `sides` belongs to the k-th of `values`. So the walk must pass all branches of a `cond`.
         sides = [1] * size if self._sides is None else self._sides[first : first + size]
         return (np.array(sides) > 0).reshape(a.shape)
 
@@ -257,6 +275,7 @@ def join_entries(value: Traced) -> Traced:
 def _choose(which: NDArray[np.generic], no: Traced, yes: Traced, *more: Traced) -> Traced:
     """Return ``select_n`` of a condition that is known; without the other case where all entries take the same."""
     cases = [_broadcast(case, which.shape or np.shape(no)) for case in (no, yes, *more)]  # one condition, many entries
+    # One case alone, so that nothing of the other has a derivative: JAX would multiply an infinite slope there by 0.
     if np.all(which == which.flat[0]):
         found = cases[int(which.flat[0])]
         return found if all(isinstance(case, np.ndarray) for case in cases) else jnp.asarray(found)
