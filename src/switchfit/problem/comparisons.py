@@ -127,6 +127,8 @@ class _Comparing(Walk[Names]):
         if (is_bend or _jumps(equation)) and STATE not in names:
             verb, line = VERBS.get(equation.primitive.name, "bends with"), find_line(origin)
             self.found += [(name, f"{verb} {name}{line and f' at {line}'}") for name in sorted(names)]
+        # Without a walk inside, a result depends on all that its operands depend on: more than is true, and a
+        # comparison may be named that is none. So calls are followed, whose results may depend on less.
         results = [names] * len(equation.outvars)
         for inner, own in _list_calls(equation, given):
             if find_public_name(inner) not in SMOOTH_FUNCTIONS:
@@ -148,6 +150,7 @@ def _list_calls(equation: Equation, given: list[Names]) -> Iterator[tuple[Jaxpr 
     """Yield the jaxprs that an operation runs, with the parameters on which their arguments depend."""
     params = equation.params
     if equation.primitive.name == "while":
+        # Operands of a loop: constants of the condition, constants of the body, then what goes round.
         first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
         yield params["cond_jaxpr"], given[:first] + given[second:]
         yield params["body_jaxpr"], given[first:]

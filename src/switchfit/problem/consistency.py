@@ -52,6 +52,7 @@ def check_names(run: Experiment, parameters: Mapping[str, Parameter]) -> None:
     for item in run.measurements:
         for name in filter(None, item.sigma_names):
             sigma = find_scalar("sigma", name)
+            # At sigma = 0 the likelihood is infinite wherever a residual is 0, and the optimizer goes there.
             if not (sigma.positive or (sigma.fixed and sigma.value > 0)):
                 raise ValueError(
                     f"sigma names the parameter {name!r}, which must stay positive: give it a lower bound above 0, or "
@@ -60,6 +61,8 @@ def check_names(run: Experiment, parameters: Mapping[str, Parameter]) -> None:
         if isinstance(item.delay, str):
             delay = find_scalar("delay", item.delay)
             require_time_unit(delay, f"the delay {item.delay!r}", run.time_unit)
+            # With a delay d, samples are of the state at t - d: all of t - d inside the horizon is a condition on the
+            # bounds of d.
             low, high = item.times[-1] - run.earliest_end, item.times[0] - run.t0
             least, most = (delay.value,) * 2 if delay.fixed else (delay.lower, delay.upper)
             if not low <= least <= most <= high:

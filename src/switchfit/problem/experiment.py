@@ -158,6 +158,7 @@ class Experiment:
     def __post_init__(self) -> None:
         self._convert_dates()
         missing = tuple(name for name in ("t0", "tf") if getattr(self, name) is None)
+        # t0 and tf, which all that follows is checked against.
         span = self._find_span(missing) if missing else (0.0, 0.0)
         t0 = span[0] if self.t0 is None else as_number(self.t0, "t0")
         tf = span[1] if self.tf is None else _check_final_time(self.tf)
@@ -175,6 +176,8 @@ class Experiment:
         given = self.transition_times
         set_fields(self, taken_from_data=missing, is_guess_proposed=given is None and len(sequence) > 1)
         if given is None:
+            # Evenly spaced only so that there is a theta: `estimate` looks for the times elsewhere
+            # (`is_guess_proposed`).
             given = _propose_times(t0, last, len(sequence) - 1, self.jump_times.tolist())
         if len(given) != len(sequence) - 1:
             raise ValueError(f"transition_times must be one fewer than the {len(sequence)} modes; got {len(given)}.")
@@ -185,6 +188,7 @@ class Experiment:
             set_fields(self, initial_state=as_state(self.initial_state))
         set_fields(self, t0=t0, tf=tf, mode_sequence=sequence, transition_times=times)
         set_fields(self, parameter_map=_check_map(self.parameter_map))
+        # All fields are set: the checks below, and the cached properties that they ask for, read them.
         self._check_times()
         self._check_data_inside()
         signals = [item.signal for item in self.references]
@@ -211,6 +215,7 @@ class Experiment:
             timed = [item for item in data if isinstance(item, (Measurements, ReferenceSignal))]
             of_data = given[: len(timed)] if all(any(list_dates(item)) for item in timed) else []  # they stand first
             origin = choose_origin(given, of_data, self.origin, self.time_zone, parts["t0"])
+            # All parts with one origin, so that differences between them are those between the dates.
             for name, part in parts.items():
                 parts[name] = count_from(part, origin, self.time_unit, names.get(name, ""))
             parts |= {"origin": origin, "time_zone": origin.time_zone or None}
@@ -254,6 +259,7 @@ class Experiment:
     @cached_property
     def times(self) -> tuple[Parameter, ...]:
         """All transition times, then tf where it is free; each bounded by the jumps between which its guess lies."""
+        # A jump at t0 acts before any transition and bounds none.
         edges = np.array([-np.inf, *self.jump_times[self.jump_times > self.t0], np.inf])
         bounded = []
         for tau, k in zip(self._own_times, np.searchsorted(edges, self.initial_times, "right"), strict=True):
@@ -281,6 +287,8 @@ class Experiment:
     @cached_property
     def is_jump(self) -> BoolArray:
         """Which of the N transitions that programs take, `times` and the jumps in between, are jumps: (N,)."""
+        # Stable, with jumps first: two at one time keep the order in which they were given, and a jump acts before a
+        # fixed transition at its time. `passed_by_jumps` says the same with "left".
         both = np.append(self.jump_times, self.initial_times)
         return np.argsort(both, kind="stable") < len(self.jump_times)  # at one time, a jump comes first
 
@@ -344,6 +352,7 @@ class Experiment:
             raise ValueError(f"transition_times must increase strictly inside (t0, tf) = {horizon}; got [{got}].")
 
     def _check_data_inside(self) -> None:
+        # A jump at tf would change a state that nothing sees any more.
         acts, last = self.jump_times, self.t0 + self.initial_length
         self._require_inside("Jump time", acts, (acts < self.t0) | (acts >= last), last, ", the end left out")
         for item in self.data:

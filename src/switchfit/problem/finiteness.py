@@ -84,11 +84,15 @@ def find_undefined(
     with use_float64():
         given = [jnp.asarray(argument, dtype=jnp.float64) for argument in arguments]
         named = [jnp.asarray(parameters[name], dtype=jnp.float64) for name in function.parameters]
+        # t is a number at each point, (N,): derivatives in it are no part of a fit.
         is_timed = bool(given) and given[0].ndim == 1
         moves = [derivatives and not (is_timed and k == 0) for k in range(len(given) + len(named))]
         check = _compile(function, tuple(np.flatnonzero(moves).tolist()), len(given))
+        # First the function as a whole, compiled, at all points: nearly always finite, and then nothing more is to be
+        # done.
         finite = np.asarray(check(given, named)).reshape(-1, 2)  # the value, and the derivatives
         for point in np.flatnonzero(~finite.all(1))[:MOST_CHECKED_POINTS].tolist():
+            # Then operation by operation, in Python, at the few points where it is not.
             walk = _Checking()
             values = [*(argument[point] for argument in given), *named]
             walk.run(function.jaxpr, function.consts, list(zip(values, moves, strict=True)))
@@ -136,11 +140,15 @@ class _Checking(Walk[Followed]):
         operands, which = [value for value, _ in given], [moves for _, moves in given]
         if name in ("jit", "pjit"):
             return self.enter(equation, equation.params["jaxpr"], given, origin)
+        # Only the branch that runs at this point: the other one may be undefined here by intention.
         if name == "cond":
             branches = equation.params["branches"]
             return self.enter(equation, branches[int(np.clip(operands[0], 0, len(branches) - 1))], given[1:], origin)
         results = evaluate(equation, operands)
+        # ``exp(1000)`` is infinite, and so is ``1e200 * 1e200``: consequences of a state that ran away, not of the
+        # function.
         is_growing = name in GROWING or (name == "integer_pow" and equation.params["y"] > 0)
+        # The first one with finite operands is the cause; all behind it inherit its NaN.
         if self.found is None and not is_growing and _are_finite(operands):
             order = _find_order(equation, operands, which, results)
             if order is not None:
@@ -152,6 +160,8 @@ class _Checking(Walk[Followed]):
 
 def _find_order(equation: Equation, operands: list[Traced], which: list[bool], results: list[Traced]) -> int | None:
     """Return the order of the first derivative of an operation in some operands that is not finite, 0 for its value."""
+    # Along all operands that move at once: one pass for each order, and what is infinite along one axis is so along a
+    # sum of all but by cancellation.
     floats = [k for k, moves in enumerate(which) if moves and _is_float(operands[k])]
 
     def call(*moved: Traced) -> list[Traced]:
@@ -164,6 +174,7 @@ def _find_order(equation: Equation, operands: list[Traced], which: list[bool], r
     def slope(*moved: Traced) -> list[Traced]:
         return jax.jvp(call, moved, ones)[1]
 
+    # Lazily: a value that is not finite needs no derivative to be looked at.
     orders = (lambda: results, lambda: slope(*at), lambda: jax.jvp(slope, at, ones)[1])
     return next((order for order, find in enumerate(orders if floats else orders[:1]) if not _are_finite(find())), None)
 

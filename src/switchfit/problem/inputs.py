@@ -118,6 +118,7 @@ class Input:
             )
         if self.kind == "cubic":
             return fit_spline(times, values)
+        # The last value is held to tf: one more knot, and behind the last sample if tf comes before it.
         if self.kind == "hold":
             times, values = np.append(times, max(tf, times[-1] + 1.0)), np.append(values, values[-1:], axis=0)
         coefficients = np.zeros((len(times) - 1, 4, values.shape[1]))

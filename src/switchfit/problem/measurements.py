@@ -101,6 +101,7 @@ class Measurements:
     def __post_init__(self) -> None:
         found = find_labels(self.values)
         times, values = check_samples(self.times, self.values, "Measurements", at_least=0, missing=True)
+        # One channel has shape (K, 1) from here on: nothing below tells (K,) from (K, q).
         values = values[:, None] if values.ndim == 1 else values
         if len(values) and np.isnan(values).all():
             raise ValueError("Measurements values are all NaN: there is nothing to fit.")
@@ -124,6 +125,8 @@ class Measurements:
             raise ValueError(
                 f"loss={self.loss!r} measures residuals in units of sigma: give it, or the name of a parameter for it."
             )
+        # The cost of a sample grows like C**2 log(r / sigma) and log sigma falls: with C <= 1 their sum has no minimum
+        # above 0.
         if self.loss == "cauchy" and self.sigma_names and scale <= 1:
             raise ValueError(
                 f"loss='cauchy' with an estimated sigma needs a loss_scale above 1, or sigma vanishes; got {scale}."
@@ -162,6 +165,7 @@ class Measurements:
     def weights(self) -> FloatArray:
         """``1 / sigma**2`` (1 if sigma is unknown or a parameter), 0 for missing samples: (K, q)."""
         sigma = self.noise(dict.fromkeys(filter(None, self.sigma_names), 1.0))
+        # 1 in place of a sigma that is a parameter: the program multiplies by 1 / sigma**2 itself.
         inverse = np.ones(self.values.shape) if sigma is None else sigma**-2.0
         return np.where(np.isnan(self.values), 0.0, inverse)
 
@@ -197,6 +201,7 @@ def _check_sigma(sigma: object, values: FloatArray) -> FloatArray | tuple[str | 
             f"sigma must be a number, of shape ({shape[1]},) (one per channel) or {shape} (one per sample); "
             f"got shape {sigma.shape}."
         )
+    # Sigma for each sample, from a table whose rows may miss the value and its sigma together.
     if sigma.shape == shape:
         sigma = np.where(np.isnan(sigma) & np.isnan(values), 1.0, sigma)
         if np.isnan(sigma).any():

@@ -130,6 +130,7 @@ def choose_origin(
     asked = None if time_zone is None else as_name(time_zone, "time_zone", form)
     if asked is not None:
         find_zone(asked)
+    # Each date counts, the origin too: one with a zone among those without is an error here, and not a shift by hours.
     every = [*given, *([] if start is None else [("origin", start)])]
     if not every:
         raise ValueError(f"time_zone is {asked!r}, but no time is a date: give origin, the date of time 0.")
@@ -140,6 +141,7 @@ def choose_origin(
             f"{what} has a time zone ({dates!r}), but {other} has none ({others!r}): give time_zone='Europe/Berlin', "
             "or whatever it is, for those."
         )
+    # The zone in which all are shown: as asked for; none if a date has none; that of all dates, or UTC if they differ.
     zones = {dates.time_zone for _, dates in zoned}
     zone = asked if asked is not None else "" if bare else zones.pop() if len(zones) == 1 else "UTC"
     start = t0 if start is None and isinstance(t0, Dates) else start
@@ -148,6 +150,7 @@ def choose_origin(
         raise ValueError(
             f"{given[0][0]} is a date, but not all times of the data are: give origin, the date of time 0."
         )
+    # Dates of several zones are compared as instants: the earliest one on a wall clock need not be the first.
     located = [dates.localize(zone, what) for what, dates in candidates]
     return make_origin(min(each.instants.min() for each in located), zone)
 

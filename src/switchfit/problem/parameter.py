@@ -77,6 +77,7 @@ class Parameter:
         set_fields(self, unit=unit, fixed=as_flag(self.fixed, "Parameter fixed"), scale=scale)
         given = {name: read_date(getattr(self, name), f"Parameter {name}") for name in ("value", *BOUNDS)}
         if any(isinstance(each, Dates) for each in (*given.values(), getattr(self.prior, "mean", None))):
+            # Dates have no numbers before an experiment has an origin; then `replace` comes here again, with numbers.
             set_fields(self, **given)  # an experiment makes numbers of them, and checks these
             return
         set_fields(self, **self._read_numbers(scale))
@@ -94,6 +95,7 @@ class Parameter:
                 raise ValueError(f"Parameter lower must not be above upper; got {bounds}.")
             raise ValueError(f"Parameter value {shorten(self.value)} lies outside its bounds {bounds}.")
         if scale == "log":
+            # The logarithm has its own bound, 0; a bound that was given stays, to be checked.
             lower = np.where(np.isneginf(lower), 0.0, lower)
             if not (np.all(value > 0) and np.all(lower >= 0)):
                 given = f"{shorten(self.value)} and the lower bound {shorten(self.lower)}"

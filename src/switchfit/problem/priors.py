@@ -155,9 +155,12 @@ class PriorTerms(NamedTuple):
 
         With ``e = (v - center) / sd``, v being p or log p, the cost is ``1/2 sum e**2``.
         """
+        # 1 where the prior is not logarithmic, since `where` differentiates both cases, and log of a negative theta is
+        # NaN.
         p = xp.where(self.log, theta, 1.0)
         e = xp.where(self.log, xp.log(p), theta) - self.center
         v_p = xp.where(self.log, 1.0 / p, 1.0)
+        # The Gauss-Newton matrix leaves out e d^2 v, which vanishes for a normal prior.
         v_pp = 0.0 if gauss_newton else xp.where(self.log, -1.0 / p**2, 0.0)
         w = self.precision
         return 0.5 * xp.sum(w * e * e, -1), w * e * v_p, w * (v_p**2 + e * v_pp)

@@ -44,6 +44,7 @@ def find_unread(problem: Problem) -> Unread:
     """
     unknowns, here = problem.unknowns, find_targets(problem, problem.structures, library=False)
     free, known = unknowns.parameters, unknowns.priors.precision > 0
+    # Found here first, without a library: most problems read all that they have, and need no more.
     left = [name for name, span in free.items() if name not in here and not known[span].any()]
     if not left:
         return Unread()

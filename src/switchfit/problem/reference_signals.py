@@ -23,6 +23,7 @@ def _interpolate(given: FloatArray | Dates, values: FloatArray, lowpass_hz: floa
     """Return the signal of samples (K,) and (K, q), broken at times that are given twice, and filtered if asked for."""
     # Dates have no unit before the experiment: until then the signal is in seconds, and not filtered.
     times = count_seconds(given) if isinstance(given, Dates) else given
+    # A simulated trajectory jumps at a reset map: a spline across the jump would ring on both sides of it.
     cuts = np.flatnonzero(np.diff(times) == 0) + 1
     pieces = np.split(times, cuts)
     if (shortest := min(map(len, pieces))) < 4:

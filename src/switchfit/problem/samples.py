@@ -54,6 +54,7 @@ def check_samples(
         raise ValueError(f"{what} needs {max(at_least, 1)} sample(s) or more; got {len(times)}.")
     if np.isinf(values).any():
         raise ValueError(f"{what} values must be finite, or NaN where a sample is missing; got infinity.")
+    # Strictly increasing, but for the breaks of a signal, where a time occurs twice and never three times.
     wrong = np.diff(times) <= 0
     if breaks:
         wrong = (np.diff(times) < 0) | np.append(times[2:] == times[:-2], False)
@@ -61,10 +62,13 @@ def check_samples(
         k = int(np.argmax(wrong))
         shown = times if dates is None else dates
         is_repeated = what == "Measurements" and times[k] == times[k + 1]
+        # Two readings of one time are honest data, of two sensors or of one that was read twice: say what to do with
+        # them.
         advice = " Samples of the same time go into a second Measurements of the experiment." if is_repeated else ""
         raise ValueError(
             f"{what} times must increase strictly; got {shown[k]} followed by {shown[k + 1]} at index {k + 1}.{advice}"
         )
+    # Arrays are shared by copies of an experiment, and programs have read them: a change would go unseen.
     times.flags.writeable = False
     values.flags.writeable = False
     return times if dates is None else dates, values

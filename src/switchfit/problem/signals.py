@@ -92,6 +92,7 @@ def filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePo
     import scipy.signal  # here, since importing it takes longer than most fits
 
     start, end = signal.knots[[0, -1]].tolist()
+    # Ten points a period of the cut-off, and no fewer than the samples: coarser ones would fold noise into the band.
     step = min(0.1 / cutoff_hz, float(np.median(np.diff(signal.knots))))
     if not (end - start) * max(10 * cutoff_hz, 1 / step) <= MOST_FILTERED:
         raise ValueError(f"lowpass_hz must not need more than {MOST_FILTERED} points, ten a period; got {cutoff_hz:g}.")
@@ -102,6 +103,7 @@ def filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePo
             f"lowpass_hz must be {LOWEST_CUTOFF * rate:.3g} or more, else all is rounding error; got {cutoff_hz:g}."
         )
     sos = scipy.signal.butter(2, cutoff_hz, fs=rate, output="sos")
+    # Three periods of the cut-off, reflected at the ends: transients of the filter decay there and not in the data.
     padding = int(min(len(grid) - 1, np.ceil(3 * rate / cutoff_hz)))
     filtered = scipy.signal.sosfiltfilt(sos, signal(grid), axis=0, padtype="odd", padlen=padding)
     return fit_spline(grid, filtered)

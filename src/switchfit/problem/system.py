@@ -100,12 +100,14 @@ class HybridSystem:
         for name, mode in self.modes.items():
             as_name(name, "mode names", "strings")
             as_callable(mode, f"mode {shorten(name)}", "a function f(t, x, p)")
+        # Read-only copies: functions are traced once, so that a dict that the user changes later must not be the same.
         set_fields(self, modes=MappingProxyType(dict(self.modes)))
         for name in ("reset_maps", "guards"):
             set_fields(self, **{name: MappingProxyType(_check_pairs(getattr(self, name), name, self.modes))})
         set_fields(self, initial_state=as_state(self.initial_state))
         for label in ("state_names", "state_units"):
             set_fields(self, **{label: as_labels(getattr(self, label), label, "state")})
+        # The number of states is known here only if they are given; of a function it is known once it is traced.
         if not callable(self.initial_state):
             self._check_labels_of(len(self.initial_state))
 
@@ -128,6 +130,7 @@ def as_state(value: object) -> InitialState:
         return value
     if isinstance(value, (list, tuple)) and any(isinstance(entry, Parameter) for entry in value):
         form = "a number or an sf.Parameter"
+        # Numbers beside a `Parameter` are fixed parameters: all entries are then of one kind.
         entries = tuple(as_parameter(entry, "each entry of initial_state", form, fixed=True) for entry in value)
         if any(entry.shape != () for entry in entries):
             shapes = shorten([entry.shape for entry in entries])

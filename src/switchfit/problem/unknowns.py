@@ -146,9 +146,11 @@ def list_unknowns(
         pieces.append(parameter)
         return slice(first, len(names))
 
+    # Transition times first, then parameters, then initial states: files of results and warm starts rely on this order.
     where: list[IntArray] = []
     prefixes = prefix_runs(experiments)
     for prefix, experiment in zip(prefixes, experiments, strict=True):
+        # -1 for what is fixed, here and below: it has no place in theta.
         positions = np.full(len(experiment.times), -1, dtype=np.intp)
         for i, tau in enumerate(experiment.times):
             if not tau.fixed:
@@ -159,6 +161,7 @@ def list_unknowns(
     states: list[IntArray] = []
     for prefix, experiment in zip(prefixes, experiments, strict=True):
         initial = initial_state_of(system, experiment)
+        # A function of p has no unknown entries of its own: what it reads are parameters.
         entries = () if callable(initial) else tuple(initial)
         positions = np.full(len(entries), -1, dtype=np.intp)
         for k, entry in enumerate(entries):
@@ -167,6 +170,7 @@ def list_unknowns(
                 unit = entry.unit or (system.state_units[k] if system.state_units else "")
                 positions[k] = add(f"{prefix}{name}(t0)", unit, entry).start
         states.append(positions)
+    # A parameter may be called `tau_1`, or two experiments alike: results are looked up by these names.
     if len(set(names)) != len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"Two unknowns share a name: {join_names(twice)}; rename the parameter or the experiment.")
@@ -186,6 +190,7 @@ def _build_ordering(
     """Return rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
     rows, bounds, constraints = [], [], []
     labels, units = name_runs(experiments), {experiment.time_unit for experiment in experiments}
+    # The rows are linear in theta. In log(tau - t0) they would not be, and a duration in minutes is not one in seconds.
     is_log = any(tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times)
     if (is_log or len(units) > 1) and any(durations.values()):
         raise ValueError(
@@ -196,15 +201,19 @@ def _build_ordering(
         run = "" if len(experiments) == 1 else labels[e]
         knots = experiment.ends_of_modes(experiment.initial_times)
         ends = np.concatenate([[-1], positions, [] if experiment.has_free_tf else [-1]]).astype(np.intp)
+        # What the ends of a mode contribute to the right-hand side where they are no unknowns: t0, tf, fixed
+        # transitions.
         known = np.where(ends < 0, knots, 0.0)
         for i, mode in enumerate(experiment.mode_sequence):
             dwell, unit = durations[mode], unit_suffix(experiment.time_unit)
             length = knots[i + 1] - knots[i]
+            # Within rounding: a guess may be exactly one minimum duration apart.
             if length < dwell * (1 - 1e-12):
                 raise ValueError(
                     f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run and f' of {run}'} "
                     f"only {length:.6g}{unit}."
                 )
+            # A mode between two fixed times has no row: nothing could change its duration.
             if ends[i] >= 0 or ends[i + 1] >= 0:
                 row = np.zeros(d + 1)  # the last entry is that of times that are fixed
                 row[ends[i + 1]] += 1.0

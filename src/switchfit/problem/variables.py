@@ -47,6 +47,7 @@ class Variables(NamedTuple):
         origin : (d,)
         """
         largest = np.where(np.isfinite(bounds), np.abs(bounds), 0.0).max(axis=0)
+        # A guess of 0 has no size: the larger bound tells in which unit it is counted.
         typical = np.where(theta != 0.0, np.abs(theta), largest)
         outside = (typical > 0) & ((typical < ORDINARY[0]) | (typical > ORDINARY[1])) & ~keep & ~log
         # A power of 2, so that scaling causes no rounding.
@@ -66,6 +67,7 @@ class Variables(NamedTuple):
     def inward(self, theta: Traced, xp: ModuleType = np) -> Traced:
         """Return z at theta (d,): of a logarithm, a bound at the origin is `LEAST_PART_OF_GUESS` first guesses away."""
         away = theta - self.origin
+        # Twice `where`: a derivative of the case left out must be finite as well.
         positive = xp.where(self.log, xp.where(away > 0, away, LEAST_PART_OF_GUESS * self.size), 1.0)
         return xp.where(self.log, xp.log(positive), theta / self.size)
 

@@ -72,6 +72,7 @@ def as_array(value: object, what: str, *, form: str = ARRAY, finite: bool = Fals
         single-precision numbers that have lost digits.
     """
     try:
+        # The fast way: most arguments are floats and float64 arrays, and are read a thousand times in a search.
         is_double = type(value) is float or (type(value) is np.ndarray and value.dtype == np.float64)
         exact = value if is_double else _read_exactly(value, what)
     except _WrongEntryError as wrong:
@@ -88,6 +89,7 @@ def as_array(value: object, what: str, *, form: str = ARRAY, finite: bool = Fals
             else "whose rows differ in length or shape"
         )
         raise ValueError(f"{what} must be {form}; got {shorten(value)}, {why}.") from None
+    # After the conversion: an integer beyond 1.8e308 becomes infinite only there.
     if finite and not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0].tolist()
         raise ValueError(f"{what} must be finite; got {array[tuple(where)]}{f' at index {where}' if where else ''}.")
@@ -146,6 +148,7 @@ def as_level(value: object) -> float:
 def as_count(value: object, what: str, *, at_least: int = 0, at_most: int = LARGEST_COUNT) -> int:
     """Return an integer of Python, NumPy or JAX as an int in the given range; floats are not accepted."""
     try:
+        # A bool is an int in Python: `seed=True` is a slip.
         count = None if isinstance(value, (bool, np.bool_)) else operator.index(value)  # type: ignore[arg-type]
     except Exception:  # TypeError; JAX's tracers raise their own
         count = None
@@ -182,6 +185,7 @@ def _read_exactly(value: Any, what: str, depth: int = 0) -> Exact:
     if table is not None:  # its columns may differ in type
         columns = [_read_exactly(column, what, depth + 1) for _, column in table]
         return np.stack([np.asarray(column) for column in columns], axis=1) if columns else np.zeros((len(value), 0))
+    # Arrays of NumPy, JAX, pandas, polars, xarray: whatever NumPy can read without a loss.
     if hasattr(value, "__array__") and not isinstance(value, type):
         return _read_array_exactly(value, what, depth)
     if isinstance(value, Sequence) and not isinstance(value, (*TEXT_TYPES, memoryview)):
@@ -203,6 +207,7 @@ def _read_exactly(value: Any, what: str, depth: int = 0) -> Exact:
 
 def _read_array_exactly(value: Any, what: str, depth: int) -> Exact:
     """Return an array, or another object with a dtype, as an array of integers or doubles."""
+    # NumPy would take the hidden number under the mask for a sample.
     if np.any(np.ma.getmask(value)):
         raise _WrongEntryError(
             value, ValueError, ", a masked array: fill in what is masked, with NaN where it is missing"
@@ -214,6 +219,7 @@ def _read_array_exactly(value: Any, what: str, depth: int) -> Exact:
         raise _WrongEntryError(value, TypeError, f", which NumPy cannot read ({type(error).__name__})") from None
     if array.dtype.kind in "Mm":
         raise _WrongEntryError(value, TypeError, NO_DATES)
+    # Objects: each entry by itself, as in a list. pandas makes such columns where a cell is missing.
     if array.dtype.kind == "O":
         return _read_exactly(array.tolist(), what, depth + 1)
     if is_low_precision(array.dtype):

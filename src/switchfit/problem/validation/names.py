@@ -18,6 +18,7 @@ def as_choice(value: object, what: str, choices: Sequence[Choice]) -> Choice:
     """Return one of the strings `choices`."""
     if isinstance(value, str) and value in choices:
         return choices[choices.index(value)]
+    # Three choices stand in the sentence with their quotes; a longer list is easier to read without.
     *others, last = map(repr, choices)
     wanted = f"{', '.join(others)} or {last}" if len(choices) <= 3 else f"one of {', '.join(choices)}"
     error = ValueError if isinstance(value, str) else TypeError

@@ -59,6 +59,7 @@ def as_callable(value: object, what: str, form: str, *, arguments: int | None = 
     arguments : int, optional
         Number of arguments with which it is called; checked if its signature is known.
     """
+    # A class is callable: `observe=Sensor` in place of `Sensor()` would be traced as a constructor.
     if not callable(value) or isinstance(value, type):
         raise TypeError(f"{what} must be {form}; got {shorten(value)}.")
     misfit = None if arguments is None else find_misfit(value, range(arguments))

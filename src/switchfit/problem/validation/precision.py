@@ -38,6 +38,7 @@ def refuse_single_precision(value: object, what: str) -> None:
         return
     given = np.asarray(value).ravel()
     wide = given.astype(np.float64)
+    # The shortest decimal text that reads back as this float32 is what the user wrote, or would have.
     meant = np.array([float(str(number)) for number in given])
     changed = np.flatnonzero(np.isfinite(wide) & (meant != wide))
     if not changed.size:
