@@ -56,9 +56,9 @@ def estimate(
     time_budget : float, optional
         Seconds after which strategies end, at the next evaluation of J. The fit from the first guess is made in any
         case, and so is the one that ends the search. With it, "auto" tries all strategies as long as a better end may
-        be elsewhere. Left out, it also ends with the first that finds nothing lower, and strategies take at most 2 s
-        after the fit, or 20 times what it took, beside the compilation of their programs; "thorough" as long as they
-        need.
+        be elsewhere. Left out, it also ends with the first that finds nothing lower, and strategies do at most 20 times
+        the work of the fit, or a few seconds' worth. Work is counted, not timed: the same input gives the same output,
+        however busy the machine is. "thorough" does as much as it needs.
 
     Returns
     -------
