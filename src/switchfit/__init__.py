@@ -6,9 +6,11 @@ NumPy, so that the command line answers ``--help`` at once. Type checkers read t
 
 from importlib import import_module as _import_module
 
+from switchfit.runtime import load_later as _load_later
 from switchfit.runtime.xla_flags import compile_small_loops_whole as _compile_small_loops_whole
 
 _compile_small_loops_whole()  # now: XLA reads its flags when it first compiles, in whatever part of the program
+_load_later(lambda: _import_module("switchfit.report"))  # which registers how results are printed and drawn
 
 __version__ = "0.1.0"
 

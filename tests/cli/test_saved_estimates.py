@@ -12,8 +12,8 @@ import pytest
 import switchfit as sf
 from support.commands import PROBLEM, ROOM, log_of, run
 from switchfit.cli.saved_estimates import list_changed_models, load_with_problem
-from switchfit.estimation.provenance import Provenance
 from switchfit.io.problem_file.loading import load_problem
+from switchfit.io.provenance import Provenance
 from switchfit.models import heater_problem
 from switchfit.runtime.errors import InputError
 

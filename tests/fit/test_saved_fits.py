@@ -17,9 +17,9 @@ from support.fits_by_hand import NOTHING, comparison_of, made, several, trajecto
 from support.models import RAMP
 from support.places import SAVED
 from switchfit.estimation.estimates import Estimate
-from switchfit.estimation.saving import FIT_FORMAT, FIT_VERSION, save_fit
 from switchfit.fit.result import Fit
 from switchfit.fit.termination import Kink
+from switchfit.io.saved_fits import FIT_FORMAT, FIT_VERSION, save_fit
 from switchfit.optimize import Status
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.json_records import find_dtype

@@ -11,7 +11,7 @@ from dataclasses import make_dataclass, replace
 from typing import Any, get_type_hints
 
 from switchfit.estimation.estimates import Estimate
-from switchfit.estimation.saving import parse_fit, write_fit
+from switchfit.io.saved_fits import parse_fit, write_fit
 from switchfit.runtime.json_records import find_dtype
 from switchfit.uncertainty.certificate import certify
 

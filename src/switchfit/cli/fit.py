@@ -209,7 +209,7 @@ def _import_figures() -> None:
 
 def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None:
     """Save an estimate; unless `complete`, its certificate omits the paper's equations, which take seconds."""
-    from switchfit.estimation.saving import save_fit
+    from switchfit.io.saved_fits import save_fit
     from switchfit.uncertainty.certificate import certify
 
     certificate = estimate.certificate if complete else certify(estimate, None)

@@ -10,8 +10,8 @@ import numpy as np
 
 from switchfit.cli.toml_writer import write_table
 from switchfit.estimation.estimates import Estimate
-from switchfit.estimation.provenance import make_relative
 from switchfit.io.problem_file.building import ProblemFile
+from switchfit.io.provenance import make_relative
 from switchfit.io.user_files import replace_files
 from switchfit.problem.experiment import Experiment
 from switchfit.runtime.errors import InputError

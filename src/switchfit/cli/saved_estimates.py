@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from switchfit.estimation.estimates import Estimate
-from switchfit.estimation.provenance import Provenance
 from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.problem_file.digests import digest_file
 from switchfit.io.problem_file.loading import load_problem
+from switchfit.io.provenance import Provenance
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation.messages import join_names
 from switchfit.runtime.errors import InputError

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,18 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from numpy.typing import ArrayLike
 
-from switchfit.estimation.provenance import Provenance
-from switchfit.estimation.saving import FIT_FORMAT, FIT_VERSION, parse_fit, save_fit
-from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Trajectory
-from switchfit.problem.experiment import Experiment
+from switchfit.io.provenance import Provenance
+from switchfit.io.saved_fits import load_fit, save_fit
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation.names import as_choice
 from switchfit.problem.validation.objects import as_flag, as_instance, as_path
 from switchfit.runtime.files import write_atomically
 from switchfit.runtime.frames import Tabular, build_pandas, describe_frame
-from switchfit.runtime.json_documents import read_document
-from switchfit.runtime.json_records import from_json
 from switchfit.runtime.presentation import (
     Displayed,
     Drawn,
@@ -469,39 +463,6 @@ class Estimate(JudgedFit, Tabular, Displayed):
         >>> bool((loaded.theta == fit.theta).all())
         True
         """
-        file = as_path(path, "path")
-        content = read_document(file, "a saved estimate", FIT_FORMAT, FIT_VERSION)
-        try:
-            fit, certificate = parse_fit(content)
-            found = replace(Estimate.take_over(fit), saved_certificate=certificate)
-            provenance = from_json(Provenance | None, content.get("provenance"), "provenance")
-        except (ValueError, OverflowError, RecursionError, MemoryError) as error:
-            raise ValueError(f"{path} is damaged: {error}.") from error
-        if provenance is not None and provenance.folder:
-            folder = os.path.normpath(file.resolve().parent / provenance.folder)
-            provenance = replace(provenance, folder=folder)
-        if problem is not None:
-            _check_loaded(found, problem, path)
-        return replace(found, problem=problem, provenance=provenance)
-
-
-def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
-    """Raise ValueError unless a fit that was loaded from a file may be that of a problem."""
-    as_instance(problem, "problem", Problem, "an sf.Problem")
-    if problem.theta_names != fit.theta_names:
-        raise ValueError(
-            f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
-            f"{', '.join(problem.theta_names)}: it is the fit of another problem."
-        )
-    runs = fit.trajectories, problem.experiments
-    clocks = [[(run.time_unit, run.origin and run.origin.instant) for run in each] for each in runs]
-    if clocks[0] != clocks[1]:
-        saved, given = (", ".join(map(_describe_clock, each)) for each in runs)
-        raise ValueError(
-            f"{path} holds times in {saved}, the problem has them in {given}, and times are not converted: give the "
-            "problem's experiments the time_unit and the origin of the file."
-        )
-
-
-def _describe_clock(run: Trajectory | Experiment) -> str:
-    return run.time_unit if run.origin is None else f"{run.time_unit} since {run.origin.date}"
+        fit, certificate, provenance = load_fit(path, problem)
+        found = cls.take_over(fit)
+        return replace(found, saved_certificate=certificate, problem=problem, provenance=provenance)

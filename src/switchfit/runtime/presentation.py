@@ -2,17 +2,18 @@
 
 Results are data. How one is written or drawn is in a later room, which registers a function for each kind of result
 (`functools.singledispatch`): their ``__str__`` and ``plot`` call `format_text` and `draw_figure`, for which the modules
-of `switchfit.report` register functions. The report thus depends
-on the results, and no result depends on the report, which is imported when a result is first written or drawn. Settings
-are the keyword arguments of the registered function.
+of `switchfit.report` register functions. The report thus depends on the results, and no result depends on the report,
+which is imported when a result is first written or drawn (`load_registering_rooms`). Settings are the keyword arguments
+of the registered function.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import singledispatch
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from switchfit.runtime import load_registering_rooms
 
 NAMED_IN_LINE = 6
 """Entries of a list that one line names."""
@@ -33,9 +34,9 @@ else:
 
 
 def call_registered(dispatcher: _SingleDispatchCallable[Returned], result: object, **settings: Any) -> Returned:
-    """Call the function that is registered for a result, after importing the report, whose modules register them.
+    """Call the function that is registered for a result, after importing the rooms that register them.
 
-    For the default of a dispatcher, which is what a result gets as long as the report is not imported.
+    For the default of a dispatcher, which is what a result gets as long as they are not imported.
 
     Parameters
     ----------
@@ -50,7 +51,7 @@ def call_registered(dispatcher: _SingleDispatchCallable[Returned], result: objec
     TypeError
         For a kind of result that no module has registered.
     """
-    import_module("switchfit.report")
+    load_registering_rooms()
     function, default = dispatcher.dispatch(type(result)), dispatcher.dispatch(object)
     if function is default:
         name = default.__name__

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from switchfit.estimation.provenance import Provenance, make_relative
 from switchfit.io.problem_file.digests import digest_file, list_files
 from switchfit.io.problem_file.experiments import Runs, build_experiments, load_named_object
 from switchfit.io.problem_file.logs import Opened
 from switchfit.io.problem_file.parameters import build_parameters
 from switchfit.io.problem_file.tables import OPTIONS, Contents
+from switchfit.io.provenance import Provenance, make_relative
 from switchfit.io.user_files import build_at
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import InputError

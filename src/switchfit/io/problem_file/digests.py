@@ -6,9 +6,9 @@ import hashlib
 from modulefinder import ModuleFinder
 from pathlib import Path
 
-from switchfit.estimation.provenance import FileDigest, make_relative
 from switchfit.io.logs.files import find_logs
 from switchfit.io.problem_file.tables import Contents
+from switchfit.io.provenance import FileDigest, make_relative
 from switchfit.io.user_files import replace_files
 
 

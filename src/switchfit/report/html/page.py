@@ -15,8 +15,8 @@ from bokeh.embed import json_item
 from bokeh.resources import Resources
 
 from switchfit.estimation.estimates import Estimate
-from switchfit.estimation.provenance import Provenance
 from switchfit.fit.result import Fit
+from switchfit.io.provenance import Provenance
 from switchfit.problem.validation.messages import unit_suffix
 from switchfit.report.certificate import tabulate_certificate
 from switchfit.report.directions import write_direction

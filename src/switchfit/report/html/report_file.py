@@ -7,7 +7,7 @@ with the extra ``report``. They and `page`, which builds the file, are imported 
 from __future__ import annotations
 
 from switchfit.estimation.estimates import Estimate
-from switchfit.estimation.provenance import Provenance
+from switchfit.io.provenance import Provenance
 from switchfit.runtime.extras import import_library
 from switchfit.runtime.presentation import format_page
 

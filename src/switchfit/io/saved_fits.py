@@ -13,14 +13,19 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from switchfit.estimation.provenance import Provenance, make_relative
 from switchfit.fit.result import Fit
-from switchfit.runtime.json_documents import write_document
+from switchfit.fit.trajectory import Trajectory
+from switchfit.io.provenance import Provenance, make_relative
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation.objects import as_instance, as_path
+from switchfit.runtime.json_documents import read_document, write_document
 from switchfit.runtime.json_records import from_json, to_json
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.verdict import Verdict, judge
@@ -94,3 +99,57 @@ def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
     if not isinstance(content, Mapping) or content.get("seal") != _compute_seal(content):
         raise ValueError("its content is not what was written")
     return from_json(Fit, content["fit"], "fit"), from_json(Certificate, content["certificate"], "certificate")
+
+
+def load_fit(path: str | Path, problem: Problem | None = None) -> tuple[Fit, Certificate, Provenance | None]:
+    """Return what `save_fit` wrote, with the folder of the problem file as it is from here.
+
+    Parameters
+    ----------
+    path : str or Path
+    problem : Problem, optional
+        That may be the one that was fitted.
+
+    Raises
+    ------
+    OSError
+        If there is no such file (FileNotFoundError) or it cannot be read.
+    ValueError
+        If it is not valid JSON, not written by switchfit, of another version, or not as it was written, or the problem
+        has other unknowns or other time units.
+    """
+    file = as_path(path, "path")
+    content = read_document(file, "a saved estimate", FIT_FORMAT, FIT_VERSION)
+    try:
+        fit, certificate = parse_fit(content)
+        provenance = from_json(Provenance | None, content.get("provenance"), "provenance")
+    except (ValueError, OverflowError, RecursionError, MemoryError) as error:
+        raise ValueError(f"{path} is damaged: {error}.") from error
+    if provenance is not None and provenance.folder:
+        folder = os.path.normpath(file.resolve().parent / provenance.folder)
+        provenance = replace(provenance, folder=folder)
+    if problem is not None:
+        _check_problem(fit, problem, path)
+    return fit, certificate, provenance
+
+
+def _check_problem(fit: Fit, problem: Problem, path: str | Path) -> None:
+    """Raise ValueError unless a fit that was loaded from a file may be that of a problem."""
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    if problem.theta_names != fit.theta_names:
+        raise ValueError(
+            f"{path} holds the unknowns {', '.join(fit.theta_names)}, the problem has "
+            f"{', '.join(problem.theta_names)}: it is the fit of another problem."
+        )
+    runs = fit.trajectories, problem.experiments
+    clocks = [[(run.time_unit, run.origin and run.origin.instant) for run in each] for each in runs]
+    if clocks[0] != clocks[1]:
+        saved, given = (", ".join(map(_describe_clock, each)) for each in runs)
+        raise ValueError(
+            f"{path} holds times in {saved}, the problem has them in {given}, and times are not converted: give the "
+            "problem's experiments the time_unit and the origin of the file."
+        )
+
+
+def _describe_clock(run: Trajectory | Experiment) -> str:
+    return run.time_unit if run.origin is None else f"{run.time_unit} since {run.origin.date}"
