@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 
-from switchfit.arrays import Traced
+from switchfit.arrays import Converted, Traced
 from switchfit.problem.validation.messages import join_names
 from switchfit.problem.validation.names import as_sequence
 
@@ -36,7 +35,7 @@ def check_modes(modes: object, known: Iterable[str]) -> tuple[str, ...]:
     return tuple(valid)
 
 
-def check_length(initial_state: Any, states: Sequence[str]) -> Traced:
+def check_length(initial_state: Converted, states: Sequence[str]) -> Converted:
     """Return an initial state that has one entry for each state; a function of p is checked where it is called.
 
     Parameters
@@ -50,6 +49,7 @@ def check_length(initial_state: Any, states: Sequence[str]) -> Traced:
     ValueError
         For another number of entries.
     """
+    # Anything else is refused by `HybridSystem`, with its own message.
     if not callable(initial_state) and not isinstance(initial_state, str) and np.ndim(initial_state) <= 1:
         count = np.size(initial_state)
         if count != len(states):

@@ -131,19 +131,24 @@ def _steer(
     front, rear = v_y + c["a"] * r, v_y - c["b"] * r  # lateral velocities of the axles
     weight = c["m"] * c["g"] / (c["a"] + c["b"])
     if front_slides:
+        # A locked wheel: friction against the whole velocity of the contact point, so that it also brakes.
         along, across = cos * v_x + sin * front, -sin * v_x + cos * front  # in the frame of the wheel
         friction = -c["mu"] * weight * c["b"] / jnp.sqrt(along**2 + across**2)
         ahead, left = friction * along, friction * across
     else:
+        # A rolling wheel: the slip angle alone; `arctan2` has a value also where v_x passes 0 in a step of the
+        # optimizer.
         ahead, left = 0.0, c["C_f"] * (delta - jnp.arctan2(front, v_x))
     if rear_slides:
         friction = -c["mu"] * weight * c["a"] / jnp.sqrt(v_x**2 + rear**2)
         pushed, R = F_x + friction * v_x, friction * rear
     else:
         pushed, R = F_x, -c["C_r"] * jnp.arctan2(rear, v_x)
+    # From the frame of the steered wheel into that of the body.
     steered = ahead * sin + left * cos  # the front axle's force across the body
     dv_x = r * v_y + (pushed + ahead * cos - left * sin) / c["m"]
     dv_y = -r * v_x + (steered + R) / c["m"]
     dr = (c["a"] * steered - c["b"] * R) / c["I_z"]
+    # The velocity from the body's frame into that of the ground.
     heading, lateral = jnp.cos(theta), jnp.sin(theta)
     return jnp.stack([v_x * heading - v_y * lateral, v_x * lateral + v_y * heading, r, dv_x, dv_y, dr])

@@ -43,6 +43,7 @@ def check_constants(
                 raise ValueError(f"{name} must be a number or the name of a parameter; got the name {value!r}.")
             found[name] = value
         else:
+            # Only numbers have a sign: that of a parameter is for its bounds to say.
             check = as_positive if name in positive else as_not_negative if name in not_negative else as_finite
             found[name] = check(value, name)
     return found

@@ -127,6 +127,7 @@ def differential_drive(
         raise ValueError(f"y_l, on the left, must be larger than y_r; got {left} and {right}.")
     if not isinstance(loss, str) and loss > 1:
         raise ValueError(f"turn_slip must be from 0 to 1; got {loss}.")
+    # "wait" moves as the first mode does, its wheels at constant speeds.
     motions = {name: name for name in names}
     if delay is not None:
         motions, names = {"wait": names[0]} | motions, ("wait", *names)
@@ -172,6 +173,7 @@ def _move(
         y_l, y_r, V_l, V_r = c["y_l"], c["y_r"], c["alpha_l"] * V_l, c["alpha_r"] * V_r
     else:
         y_l, y_r = c["track"] / 2, -c["track"] / 2
+    # Both sides roll about centers of their own: y_l and y_r where they slip, half the track where they grip.
     turn = (V_r - V_l) / (y_l - y_r)
     v_x = (V_r * y_l - V_l * y_r) / (y_l - y_r)
     if slips and not is_absent(constants["turn_slip"]):
@@ -186,5 +188,6 @@ def _move(
     if not commanded:
         return jnp.stack([dX, dY, turn])
     if waits:
+        # Before the delay has passed, the wheels have not heard of the command.
         return jnp.stack([dX, dY, turn, 0.0 * w_l, 0.0 * w_r])
     return jnp.stack([dX, dY, turn, (given[0] - w_l) / c["lag"], (given[1] - w_r) / c["lag"]])

@@ -102,8 +102,10 @@ def _bend(constants: Constants, direction: int, t: Traced, x: Traced, p: Mapping
     position, v, z = x
     c = Values(constants, p)
     level = c["F_c"] + (c["F_s"] - c["F_c"]) * jnp.exp(-((v / c["v_s"]) ** 2))  # G(v)
+    # |v| is direction * v, so that the field is smooth within a mode.
     dz = v - direction * c["sigma_0"] * v * z / level
     friction = c["sigma_0"] * z + c["sigma_1"] * dz + c["sigma_2"] * v
     (force,) = read_input(jnp.ravel(u), ("force or position",))
+    # Without a spring the input is the force itself: not k (u - x) with k = 0.
     pull = force if constants["k"] == 0.0 else c["k"] * (force - position)
     return jnp.stack([v, (pull - friction) / c["m"], dz])

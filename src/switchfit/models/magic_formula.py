@@ -151,6 +151,8 @@ def _drive(constants: Constants, aligning: bool, t: Traced, x: Traced, p: Mappin
     V_x = cos * dX + sin * dY - left * dtheta
     V_y = -sin * dX + cos * dY + ahead * dtheta
     tread = c["wheel_radius"] * jnp.stack(read_input(u, WHEELS))
+    # The mean square of the speeds of the ground and of the tread, rounded off at low speeds, where slip has no
+    # meaning.
     V_squared = 0.5 * (V_x**2 + tread**2) + c["low_speed"] ** 2
     creep = jnp.sqrt((tread - V_x) ** 2 + V_y**2 + SMALL_SLIP**2 * V_squared)
     slip = creep / jnp.sqrt(V_squared)  # the norm of s

@@ -109,8 +109,11 @@ def _slope(constants: Constants, c: Values) -> tuple[Traced, Traced]:
 def _slide(constants: Constants, direction: int, t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
     c = Values(constants, p)
     cos, sin = _slope(constants, c)
+    # Along the plane: the normal force times mu, against the slip of the contact point, whose sign is that of the mode
+    # and not of the state. So the field stays smooth if a transition is tried too late.
     friction = direction * c["mu"] * c["g"] * cos
     dv = -friction - c["g"] * sin
+    # ``0.0 * x[1]``: constants are floats, and `stack` needs the type of the state.
     return jnp.stack([x[1], dv + 0.0 * x[1], friction / (c["inertia"] * c["radius"]) + 0.0 * x[1]])
 
 
@@ -122,4 +125,5 @@ def _roll(constants: Constants, t: Traced, x: Traced, p: Mapping[str, Traced]) -
 
 
 def _get_slip(constants: Constants, t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
+    # The speed of the contact point: zero where the body rolls.
     return x[1] - Values(constants, p)["radius"] * x[2]

@@ -178,6 +178,7 @@ def skid_steer(
         field: VectorField = _move_by_input if forces is None else partial(_move, forces[0 if name == "stick" else 1])
         fields[name] = partial(field, STUCK_AXLES[name], constants)
     if restick == "reset":
+        # Only where an axle sticks that has slipped: an impulse at one that sticks already would be zero.
         resets = {
             (before, after): partial(_stop_axles, STUCK_AXLES[after], constants)
             for before, after in permutations(names, 2)
@@ -255,6 +256,7 @@ def _move(
         ddX, ddY = ddX - c["g"] * c["slope_x"], ddY - c["g"] * c["slope_y"]
     turning = 12 * c["b"] * (F_1 - F_2 - F_3 + F_4)
     slipping = {side: names for side, names in FRICTIONS.items() if side not in stuck}
+    # The paper's own terms where both axles have one friction: in this form, and to the last bit, they are (18).
     if not stuck and constants["mu_front"] == constants["mu_rear"]:
         mu = c["mu_front"]
         ddX = ddX + c["g"] * mu * sin * v  # (18)
@@ -274,6 +276,8 @@ def _move(
             turning = turning - 12 * side * c["a"] * m * force
     ddtheta = turning / inertia
     for side in stuck:  # lambda of the Notes, a unit of mass
+        # The lateral acceleration of the axle without its force: v' + s a ddtheta, v' = -sin ddX + cos ddY - dtheta
+        # along.
         slowing = -sin * ddX + cos * ddY - dtheta * along + side * c["a"] * ddtheta
         force = -slowing / (1 + 12 * m * c["a"] ** 2 / inertia)
         ddX, ddY = ddX - force * sin, ddY + force * cos
@@ -291,6 +295,7 @@ def _stop_axles(stuck: tuple[int, ...], constants: Constants, t: Traced, x: Trac
     (side,) = stuck
     c = Values(constants, p)
     m, inertia = _masses(c)
+    # m a²/I, with twelve times the moment of inertia, as (18) has it.
     ratio = 12 * m * c["a"] ** 2 / inertia
     v = -sin * dX + cos * dY
     impulse = -(v + side * c["a"] * dtheta) / (1 + ratio)  # a unit of mass

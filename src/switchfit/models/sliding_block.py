@@ -67,6 +67,7 @@ def sliding_block(*, g: Constant = 9.81) -> HybridSystem:
 
 
 def _brake(constants: Constants, t: Traced, x: Traced, p: Mapping[str, Traced]) -> Traced:
+    # The direction of the initial velocity, and not of the present one: see the docstring.
     speed = jnp.sqrt(p["vx0"] ** 2 + p["vy0"] ** 2)
     deceleration = p["mu"] * Values(constants, p)["g"] / speed
     return jnp.stack([x[2], x[3], -deceleration * p["vx0"], -deceleration * p["vy0"]])

@@ -19,8 +19,6 @@ from switchfit.problem.dates import Dates, Given, as_date, find_zone, format_ins
 from switchfit.problem.time_units import SECONDS_OF_UNIT, TIMEDELTA_OF_UNIT, normalize_time_unit
 from switchfit.problem.validation.names import as_name
 
-# --- the origin of an experiment --------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True)
 class Origin:

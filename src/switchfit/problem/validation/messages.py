@@ -16,8 +16,6 @@ LONGEST_SHOWN_VALUE = 120
 MOST_LISTED = 10
 """Largest number of names that a message lists."""
 
-# --- what messages show -----------------------------------------------------------------------------------------------
-
 
 _SHORT = reprlib.Repr()
 """Representations of bounded length, computed in bounded time."""

@@ -17,9 +17,6 @@ from switchfit.problem.validation.names import as_sequence
 T = TypeVar("T")
 
 
-# --- everything else --------------------------------------------------------------------------------------------------
-
-
 def set_fields(record: object, **values: object) -> None:
     """Set fields of a frozen dataclass while it is being built."""
     for name, value in values.items():

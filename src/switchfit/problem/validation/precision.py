@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import DTypeLike
 
-# --- single precision -------------------------------------------------------------------------------------------------
-
 
 def is_low_precision(dtype: DTypeLike) -> bool:
     """Return whether this is the dtype of floating-point numbers of less than double precision."""
