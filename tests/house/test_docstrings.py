@@ -81,7 +81,7 @@ def test_examples_run_and_print_what_they_say(name, optimised_machine_code):
     report = []
     result = doctest.DocTestRunner(verbose=False).run(examples, out=report.append)
     assert result.failed == 0, "".join(report)
-    assert result.attempted > 1
+    assert result.attempted >= 1
 
 
 @pytest.mark.parametrize("name", [name for name, item in PUBLIC.items() if section(item, "See Also")])

@@ -65,7 +65,7 @@ def load_problem(
     --------
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>> from switchfit.io.problem_file.writing import write_first_problem
+    >>> from switchfit.cli.first_problem import write_first_problem
     >>> from switchfit.io.problem_file import load_problem
 
     >>> with TemporaryDirectory() as folder:
