@@ -1,7 +1,8 @@
 """Mistakes drawn over all rooms by a rule, for `mutate.MISTAKES`: not by hand, which would draw where tests look.
 
-The rule: in each room, of all comparisons, sums, products and conjunctions in its functions the `PER_ROOM` whose lines
-have the smallest hashes, each replaced by its opposite. A line stays drawn until it is changed.
+The rule: in each room with its folders, of all comparisons, sums, products and conjunctions in its functions the
+`PER_ROOM` whose lines have the smallest hashes, each replaced by its opposite. A line stays drawn until it is changed,
+in whichever file of its room it stands.
 """
 
 from __future__ import annotations
@@ -41,10 +42,17 @@ NAMES = {
     "closed_forms",
     "engine": "closed_forms corner_branches corner_derivatives sliding paths_not_followed friction_and_tanks "
     "corners_at_known_times rows_and_nodes stiffness following both_engines machine_code",
+    "engine/adaptive": "stiffness implicit_rows rows_and_nodes following",
+    "engine/corners": "closed_forms corner_derivatives sliding paths_not_followed friction_and_tanks",
+    "engine/jax": "both_engines closed_forms random_systems insertion_rates",
     "engine/native": "machine_code both_engines closed_forms random_systems beam implicit_rows operations "
     "functions_of_jax",
-    "estimation": "saved_estimates estimate refinement saved_fits rows_and_nodes following bad_input hard_moments "
-    "hidden_switches",
+    "engine/native/llvm": "machine_code operations functions_of_jax both_engines",
+    "engine/native/loops": "both_engines closed_forms random_systems implicit_rows",
+    "engine/native/scalars": "operations machine_code functions_of_jax random_systems",
+    "engine/native/tracing": "functions_of_jax machine_code both_engines",
+    "estimation": "comparison saved_estimates estimate refinement saved_fits rows_and_nodes following bad_input "
+    "hard_moments hidden_switches",
     "experiment_design": "information designs design_command",
     "fit": "estimate refinement jumps following finiteness closed_forms starts_benchmark "
     "choice_of_strategies ends_of_searches known_order many_starts hops other_minima guards verdict "
@@ -52,6 +60,7 @@ NAMES = {
     "io": "problem_files saved_estimates first_problem frames files many_logs",
     "io/logs": "text_logs log_formats time_units losses_priors_delays gps_drive dates",
     "io/problem_file": "problem_files first_problem files dates saved_estimates bad_input modes_command jumps",
+    "meshes": "both_engines refinement following rows_and_nodes stiffness estimate implicit_rows",
     "models": "vehicles vehicle_mechanics",
     "modes": "found_sequences verdicts_of_searches searches_kept schedules insertion_rates",
     "online": "tracking late_and_missing_samples alarms_and_budgets online_command",
@@ -59,35 +68,40 @@ NAMES = {
     "chunks choice_of_strategies ends_of_searches known_order many_starts hops other_minima "
     "several_runs",
     "paper": "claims closed_forms",
+    "paper_adjoint": "adjoint closed_forms",
     "problem": "bad_input cost_of_data corner_branches corner_derivatives sliding paths_not_followed "
     "friction_and_tanks corners_at_known_times dates numbers_given validation comparison "
     "functions_of_jax finiteness zero_times_nan",
+    "problem/corners": "corner_branches corners_at_known_times corner_derivatives sliding friction_and_tanks",
+    "problem/validation": "numbers_given bad_input single_precision time_units dates",
     "report": "online_report fit_report figures verdict frames found_sequences verdicts_of_searches "
     "searches_kept validation comparison numbers_given verdicts_of_many",
     "report/html": "html_page",
-    "runtime": "progress saved_fits files threads bad_input",
+    "runtime": "ends_of_searches compilations jax_internals progress saved_fits files threads bad_input",
     "strategy": "validation comparison choice_of_strategies ends_of_searches known_order many_starts hops "
     "other_minima beam numbers_given starts_benchmark free_final_time",
     "uncertainty": "covariances identifiability residuals certificate profiles prediction verdict validation "
     "comparison",
 }
 TESTS = {room: names.split() for room, names in NAMES.items()}
-"""What must notice the mistakes of each room: files of tests, one after the other until something does."""
+"""What must notice the mistakes of each folder: files of tests, one after the other until something does."""
 
 
 def draw_mistakes(source: Path) -> Iterator[tuple[str, str, str, str, str]]:
-    """Yield room, name, file, text and text with the mistake of each mistake that the rule draws."""
-    for room in TESTS:
-        paths = sorted([*source.glob(f"{room}.py"), *(source / room).glob("*.py")])  # of a module or a folder
-        found = [each for path in paths for each in _list_mistakes(path)]
-        by_hash = {key: mistake for key, *mistake in found}  # one of those that a line has twice
+    """Yield folder, name, file, text and text with the mistake of each mistake that the rule draws."""
+    for room in (name for name in TESTS if "/" not in name):
+        paths = sorted([*source.glob(f"{room}.py"), *(source / room).rglob("*.py")])  # of a module or a folder
+        found = [each for path in paths for each in _list_mistakes(path, room)]
+        by_hash = {key: mistake for key, *mistake in found}  # one of those that the room has twice
         for key in sorted(by_hash)[:PER_ROOM]:
             name, path, text, mistaken = by_hash[key]
-            yield room, name, str(path.relative_to(source)), text, mistaken
+            file = path.relative_to(source)
+            folder = next(each.as_posix() for each in (file.with_suffix(""), *file.parents) if each.as_posix() in TESTS)
+            yield folder, name, file.as_posix(), text, mistaken
 
 
-def _list_mistakes(path: Path) -> Iterator[tuple[str, str, Path, str, str]]:
-    """Yield hash, name, file, text and mistaken text of each mistake that could be drawn in a file."""
+def _list_mistakes(path: Path, room: str) -> Iterator[tuple[str, str, Path, str, str]]:
+    """Yield hash, name, file, text and mistaken text of each mistake that could be drawn in a file of a room."""
     text = path.read_text()
     lines, tree = text.splitlines(keepends=True), ast.parse(text)
     starts = [0]
@@ -104,8 +118,9 @@ def _list_mistakes(path: Path) -> Iterator[tuple[str, str, Path, str, str]]:
                 continue
             mistaken = encoded[:begin].decode() + between.replace(old, new) + encoded[end:].decode()
             line = lines[left.end_lineno - 1].strip()
-            where = f"{path.name}: {old} -> {new} in {line} ({left.end_col_offset - node.col_offset})"
-            yield hashlib.sha256(where.encode()).hexdigest(), where, path, text, mistaken
+            what = f"{old} -> {new} in {line} ({left.end_col_offset - node.col_offset})"
+            key = hashlib.sha256(f"{room}: {what}".encode()).hexdigest()
+            yield key, f"{path.name}: {what}", path, text, mistaken
 
 
 def _list_expressions(tree: ast.AST) -> Iterator[ast.expr]:
