@@ -318,7 +318,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
         ),
         "what changes nothing": swap(SPLIT, "(kinds >= 0) & ~is_idle, is_idle", "kinds >= 0, kinds > 1e9"),
         "what is touched": swap(SPLIT, "if touched.any():", "if False:"),
-        "rounding at rest": swap("engine/corners", "coarse), p, smallest)", "coarse), p)"),
+        "rounding at rest": swap("engine/adaptive", "coarse), p, smallest)", "coarse), p)"),
         "sliding": swap(SPLIT, "else -1\n        return 0", "else -1\n        return 1"),
         "a jump of the input": swap(SPLIT, "if after != self.sides:", "if False:"),
         "the end of sliding": swap(CORNERS, "[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]"),
