@@ -236,8 +236,8 @@ class Kernels:
             # pay for.
             along = rows.tangent(tableau, h, found.slopes, of_x, forcing, Z, h_d, factors)
             vectors = along.states + (along.slopes if k and moving else [])
-            stores += keep("XZ", 0, [as_vector(graph, value) for value in np.concatenate(vectors)])
-            stores += store_all("Z_after", 0, [as_vector(graph, value) for value in along.after])
+            stores += keep("XZ", 0, [_as_vector(graph, value) for value in np.concatenate(vectors)])
+            stores += store_all("Z_after", 0, [_as_vector(graph, value) for value in along.after])
             stores += () if self.adjoint else self._add_to_step(graph, stage, tableau, found, along, costs)
         if costs:
             densities = [values[wanted.index(ELL)].item() for values in at_stages]
@@ -278,9 +278,9 @@ class Kernels:
             # future.
             g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
             second.append(list_entries(S, with_time=False))
-            stores += store_all("XZ", j * self.sizes.n, [as_vector(graph, value) for value in X_d])
+            stores += store_all("XZ", j * self.sizes.n, [_as_vector(graph, value) for value in X_d])
         self.chosen, entries = self._store_entries(graph, tableau, second)
-        return [*stores, ("g", 0, as_vector(graph, g)), *entries]
+        return [*stores, ("g", 0, _as_vector(graph, g)), *entries]
 
     def judge_row(self, mode: int, stage: Template, tableau: Tableau) -> None:
         """Write what a row that was computed adds to the largest errors: its own one; and a jump inside, which counts
@@ -401,8 +401,8 @@ class Kernels:
                         K_d.append(times_vector(D_1f, X_d) + self._along_p(graph, f_p) + f_t * times_d[j])
                     ell_d.append((l_x * X_d).sum() + self._along_p(graph, l_p) + l_t.item() * times_d[j])
                 factor_d = rows.length_factor(tableau, psi, found.states, K_d, ell_d)
-                stores.append(("length", 0, as_vector(graph, factor_d)))
-        stores.append(("g", 0, as_vector(graph, g)))
+                stores.append(("length", 0, _as_vector(graph, factor_d)))
+        stores.append(("g", 0, _as_vector(graph, g)))
         # S_j goes to memory, not to H: Z' S Z is long, and rows of all modes share the functions that add it.
         chosen, entries = self._store_entries(graph, tableau, second)
         self.module.write_straight_line(name, stores + entries + graph.check())
@@ -504,7 +504,7 @@ class Kernels:
             R_t, R_x, R_p = template(graph, *given, only=(1, 2, 3))
             Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
             Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves
-            stores += store_all("Z_after", 0, [as_vector(graph, v) for v in Z_after])
+            stores += store_all("Z_after", 0, [_as_vector(graph, v) for v in Z_after])
         self.module.write_straight_line(name, stores + (graph.check() if checked else []))
 
     def _map_back(self, name: str, template: Template, of_start: bool) -> None:
@@ -527,7 +527,7 @@ class Kernels:
         t, t_p = self.templates.late_time(k)(graph, *self._load_inputs(graph, "time", "p"), checked=True)
         stores = [("row", 1, t.item())]
         if self.order > Order.COST:
-            stores.append(("closes", 0, as_vector(graph, self._along_p(graph, t_p))))
+            stores.append(("closes", 0, _as_vector(graph, self._along_p(graph, t_p))))
         self.module.write_straight_line(f"late_time_{k}", stores + graph.check())
 
     def _write_node(
@@ -566,7 +566,7 @@ class Kernels:
         if self.order > Order.COST:
             h_x, h_p = jacobians
             y_d = times_vector(h_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, h_p)
-            stores += store_all("Y", 0, [as_vector(graph, value) for value in y_d])
+            stores += store_all("Y", 0, [_as_vector(graph, value) for value in y_d])
         self.module.write_straight_line("outputs", stores + graph.check())
 
     # Shared parts
@@ -631,7 +631,7 @@ class Kernels:
             g = g + (g_x * graph.loads("Z", self.sizes.n, vector=True)).sum()
         if moving:
             g = g + g_t.item() * graph.load("moves", 0, vector=True)
-        stores = [("g", 0, as_vector(graph, g))]
+        stores = [("g", 0, _as_vector(graph, g))]
         H = [graph.load("H", d, vector=True) for d in range(self.sizes.D)]
         of_time = self._directions(graph, "moves", 1) if moving else [NO_DERIVATIVE]
         along = [*of_time, *self._directions(graph, "Z", self.sizes.n)]
@@ -660,7 +660,7 @@ class Kernels:
             c_d = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
             if moving:
                 c_d = c_d + c_t * graph.load("moves", 0, vector=True)
-            stores += store_all("jacobian", 0, [as_vector(graph, value) for value in c_d])
+            stores += store_all("jacobian", 0, [_as_vector(graph, value) for value in c_d])
         stores += store_all("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
         return stores + self._scalar(graph, derivatives, moving)
 
@@ -710,7 +710,7 @@ def _store_changed_rows(H: list[Node], rows: list[Node]) -> list[Store]:
     return [("H", d, row) for d, (old, row) in enumerate(zip(H, rows, strict=True)) if row is not old]
 
 
-def as_vector(graph: Graph, value: Scalar) -> Node:
+def _as_vector(graph: Graph, value: Scalar) -> Node:
     """Return a vector node, also if the value turned out to be a scalar zero."""
     if isinstance(value, Node) and value.vector:
         return value

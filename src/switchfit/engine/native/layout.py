@@ -54,7 +54,7 @@ def get_address(array: NDArray[Any]) -> int:
         return int(array.ctypes.data)
 
 
-def count_kept(library: Structure, n: int, order: Order) -> int:
+def _count_kept(library: Structure, n: int, order: Order) -> int:
     """Return how many doubles a row keeps at most for its backward step."""
     has_factors = order > Order.COST and any(library.implicit)
     return STAGES * MOST_KEPT_VALUES * n + (count_factors(n, len(STIFF.b)) if has_factors else 0)
@@ -101,7 +101,7 @@ def layout_of(library: Structure, sizes: Sizes, order: Order) -> MemoryLayout:
     late = int(any(sensor.delay is not None for sensor in library.measurements))
     # A row keeps what its backward step reads: the states of its stages, with the slopes of an implicit row behind
     # them; their tangents; functions of the C library and factors.
-    of_row = {"X": STAGES * n, "XZ": STAGES * n * width, "kept": count_kept(library, n, order)}
+    of_row = {"X": STAGES * n, "XZ": STAGES * n * width, "kept": _count_kept(library, n, order)}
     # psi is among the sums since it starts at zero: nothing follows tf. The backward sweep leaves psi(t0) in it.
     sums = {"psi": n, "J": 1, "g": width, "H": sizes.D * width}
     sums |= {"constraints": count, "jacobian": count * width, "errors": n, CHECKED: 1}

@@ -32,7 +32,7 @@ def reason_for_jax(structure: Structure, arguments: Arguments) -> str | None:
     return program if isinstance(program, str) else None
 
 
-def estimate_row(writer: Writer, mode: int, curvature: CurvatureFunction) -> int:
+def _estimate_row(writer: Writer, mode: int, curvature: CurvatureFunction) -> int:
     """Return the work of a row of a mode in an evaluation with second derivatives, in additions."""
     names = [f"forward_inner_{mode}", f"backward_inner_{mode}", *(curvature.name for _ in curvature.stages)]
     newton = USUAL_ITERATIONS * writer.module.work[f"newton_{mode}"] if writer.library.implicit[mode] else 0
@@ -66,7 +66,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module) -> It
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
         if order > Order.COST:
-            module.row_work.append(estimate_row(writer, mode, curvatures[mode]["inner"]))
+            module.row_work.append(_estimate_row(writer, mode, curvatures[mode]["inner"]))
         yield module.take()
     # Before the loops that call them: a call needs the pointers of its function.
     kernels.nodes()

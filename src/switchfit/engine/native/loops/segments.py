@@ -54,8 +54,8 @@ def _units(writer: Writer, found: Pointers, moves: Value, index: Value) -> Value
     return writer.at(found["units"], moves.choose(index, 0), writer.sizes.width)
 
 
-def row_pointers(writer: Writer, found: Pointers, segment: Value, cell: Value, last: Value) -> tuple[Pointers, Value]:
-    """Emit the pointers of the row of a segment in a cell; return them with the case of `row_cases`."""
+def _row_pointers(writer: Writer, found: Pointers, segment: Value, cell: Value, last: Value) -> tuple[Pointers, Value]:
+    """Emit the pointers of the row of a segment in a cell; return them with the case of `_row_cases`."""
     # Rows are numbered by cell + segment, as in `mesh.build_rows`; states by the row that they are before, so that the
     # state after row r is state r + 1.
     place, row, ends = start_row(writer, found, segment, cell), cell + segment, cell.equals(last)
@@ -80,7 +80,7 @@ def count_rows(writer: Writer, found: Pointers) -> Value:
     return writer.get("i64", found["first_cell"], writer.sizes.N + 1) + (writer.sizes.N + 1)
 
 
-def row_cases(writer: Writer, case: Value) -> Iterator[tuple[int, str]]:
+def _row_cases(writer: Writer, case: Value) -> Iterator[tuple[int, str]]:
     """Emit a switch among the modes and `KINDS` of rows."""
     for k in writer.cases(case, len(ROW_KINDS) * len(writer.library.modes)):
         yield k // len(ROW_KINDS), ROW_KINDS[k % len(ROW_KINDS)]
@@ -155,10 +155,10 @@ def write_forward(writer: Writer) -> str:
     mode, modes = writer.get("i64", found["modes"], segment), len(writer.library.modes)
     # Inclusive at both ends: the cell that a transition cuts is the last of one segment and the first of the next.
     with writer.loop(first, last + 1) as cell:
-        given, case = row_pointers(writer, found, segment, cell, last)
+        given, case = _row_pointers(writer, found, segment, cell, last)
         # The first row begins behind the reset map, whose state is not among those of the rows.
         given |= {name: given["first"].choose(start[name], given[name]) for name in ("x", "Z")}
-        for k, kind in row_cases(writer, case):
+        for k, kind in _row_cases(writer, case):
             writer.take_step(k, f"forward_{kind}", given)
         for level, name in enumerate(("error_{}", "jump_{}") if writer.order > Order.COST else ()):
             writer.call_one_of((flag > level).choose(mode, -1), modes, given, name)
@@ -205,8 +205,8 @@ def write_backward(writer: Writer, curvatures: Sequence[dict[str, CurvatureFunct
     first, last = (writer.get("i64", found["first_cell"], k) for k in (segment, segment + 1))
     # Last row first. `psi` is one vector, which each row replaces by that at its start.
     with writer.loop(0, last - first + 1) as turn:
-        given, case = row_pointers(writer, found, segment, last - turn, last)
-        for k, kind in row_cases(writer, case):
+        given, case = _row_pointers(writer, found, segment, last - turn, last)
+        for k, kind in _row_cases(writer, case):
             writer.call(f"backward_{kind}_{k}", given)
             add_curvature(writer, curvatures[k][kind], given, moving=kind == "end")
     if writer.library.reset_maps:
