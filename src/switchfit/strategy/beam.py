@@ -112,6 +112,8 @@ def follow_order(
     found, run = prepare(problem, e), problem.experiments[e]
     modes = np.array([found.modes.index(mode) for mode in run.mode_sequence])
     shortest = np.array([problem.durations[mode] for mode in run.mode_sequence])
+    # The limits are those of the time, which a birth at a node only begins: one that is born up to a grid interval
+    # outside may still move inside.
     reach = np.array([[-found.grid], [found.grid]])  # a birth moves by up to the grid
     rules = Rules.of_order(modes, shortest, found.limits[: len(modes) - 1].T + reach)
     return found.run(rules, parameters, 0.0, MOST_PER_SEQUENCE * len(modes), replays, evidence)
@@ -185,6 +187,8 @@ class Beam:
             marks = np.union1d(marks, seen[:: max(len(seen) // MOST_GRID_INTERVALS, 1)])
         mesh = build_mesh(run, self.grid, marks)
         self.times, self.stops = mesh.times, choose_stops(mesh.times, self.grid, marks)
+        # Only n/2 log(2 J / n) needs the number of values; with sigma known, scores are in units of log likelihood as
+        # they are.
         is_unknown = any(item.sigma is None for item in run.measurements)
         self.counts = count_values(run.measurements, mesh.times) if is_unknown else None
         structure, self.functions, jumps = trace_library(problem, e, library, self.births, mesh)
@@ -210,6 +214,7 @@ class Beam:
         self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
         self.spread = np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD)
         self.noise = assume_noise(problem)  # that of all runs
+        # The inverse of the variance of tau, given the state and p, in units of J.
         guards = (self.noise / (GUARD_SD * self.grid)) ** 2
         self.tolerances = HypothesisTolerances(max(LEAST_BEAM_RTOL, problem.rtol), problem.atol / problem.rtol, guards)
         self.lock = threading.Lock()
@@ -243,6 +248,8 @@ class Beam:
             return []
         whole = np.asarray(parameters, dtype=np.float64)
         with self.lock, np.errstate(all="ignore"):  # far from the data numbers may overflow
+            # One pass at a time: its settings and scratch space are the engine's, and a beam belongs to all who have
+            # the problem.
             found = Pass(self, rules, whole[self.own], penalty, evidence).run(width, replays)
         for k, proposal in enumerate(found):
             placed = whole.copy()
@@ -270,6 +277,7 @@ class Pass:
     ) -> None:
         self.beam, self.rules, self.parameters, self.penalty, self.evidence = beam, rules, parameters, penalty, evidence
         self.reaches = beam.reaches
+        # A bound that is infinite, or equal to the other one, says nothing about the size of an unknown.
         half = 0.5 * (beam.upper - beam.lower)
         bounded = np.isfinite(half) & (half > 0)
         # Size of each unknown: its value; at zero, half its bounds; without either, 1. Bounds limit the spread too.
@@ -309,6 +317,8 @@ class Pass:
     ) -> tuple[Sequences, Hypotheses, Integers]:
         """Return hypotheses, of which those with records in `chosen` are kept, at a later one of the stops."""
         beam, rules = self.beam, self.rules
+        # A given order needs no selection by Python between stops: its whole stretch is one call of machine code, with
+        # the same proposals to the last bit (a beam of ten tosses: 7.6 ms in place of 14.4).
         if self.order is not None:
             last, births = kept.last[:, None], kept.times
             given = states.records[chosen], kept.mode, np.concatenate([last, births], axis=1), self.order, *ends
@@ -341,6 +351,7 @@ class Pass:
         children = self.steps[places, np.minimum(places + 1, places[-1])]
         children[:, SLOT] = places
         counts = np.zeros((2, len(places), 3), dtype=np.int64)
+        # Row 0 for a hypothesis that stays in its place, row 1 for one that leaves it.
         counts[1, :, 0], counts[:, :, 1] = 1, rules.modes
         return OrderTables(children, counts, windows, self.beam.stops.astype(np.int64))
 
@@ -379,6 +390,8 @@ class Pass:
         children, padded = np.empty((B, beam.births, CHILD_COLUMNS), dtype=np.int64), np.empty((B, beam.births))
         if counts[:, 0].any():  # no others are read
             children[:, :S], padded[:, :S] = self.steps[kept.modes[:, :-1], kept.modes[:, 1:]], times
+            # Births fill the last slots: online, the first ones are entries e of what was before the window, which no
+            # birth may use.
             children[:, :S, SLOT] = entries + np.arange(S)
         p = self.parameters[beam.places] + start.moved[:, beam.births :]
         return beam.engine.replay(start, p, counts, children, padded, stop, first, recentres=recentres)
@@ -392,6 +405,7 @@ class Pass:
         J, gradients, matrices = unused, np.zeros((B, D)), np.repeat(self.matrix[None], B, axis=0)
         if not self.has_priors and self.evidence is None:
             return Hypotheses(unused, J, gradients, matrices, moved, unused, unused)
+        # The priors are taken where the hypothesis is, not where the pass began: J and g of a prior change as p moves.
         q = self._move(moved)
         g = np.zeros(q.shape)
         if self.has_priors:
@@ -400,6 +414,7 @@ class Pass:
         if self.evidence is not None:
             rise, slope = self.evidence.evaluate(q)  # what other experiments say is not only curvature
             J, g = J + rise, g + slope
+        # Under each name of a parameter, as the terms of H_0 are.
         gradients[:, beam.births :] = g[:, beam.places]
         return Hypotheses(unused, J, gradients, matrices, moved, unused, unused)
 
@@ -412,6 +427,7 @@ class Pass:
         """
         beam, places = self.beam, self.beam.places
         weak = np.where(beam.priors.precision > 0, 0.0, self.weak)[places]
+        # noise^2 turns the inverse of a variance into units of J where sigma is unknown; it is 1 where sigma is known.
         matrix = np.diag(np.append(12.0 * (beam.noise / self.reaches) ** 2, weak))
         matrix[beam.births :, beam.births :] += TIE_STIFFNESS * self.weak[places] * beam.ties
         if self.evidence is not None:
@@ -427,6 +443,7 @@ class Pass:
     @cached_property
     def steps(self) -> Integers:
         """What a table of children has for each pair of places, (K, K, 7); a hypothesis that stays has no functions."""
+        # Columns that are not set here, PARENT and SLOT, belong to a hypothesis and not to a pair of modes.
         functions, modes = self.beam.functions, self.rules.modes
         steps = np.full((*functions.shape[1:], CHILD_COLUMNS), -1, dtype=np.int64)
         steps[..., BEFORE], steps[..., AFTER] = modes[:, None], modes
@@ -438,11 +455,15 @@ class Pass:
         beam, at = self.beam, self.parameters
         near = np.where((beam.lower >= 0) & (at > 0), SMALLEST_PART_OF_PARAMETER * at, beam.lower)  # 0 may be no value
         low, high, most = np.maximum(beam.lower, near) - at, beam.upper - at, MOST_AT_ONCE * self.spread
+        # A step of a time is limited by nothing but its reach; that of p by one spread, since a linear model of the
+        # first few samples may send it anywhere.
         pairs = (-self.reaches, low), (self.reaches, high), (self.reaches, most)
         return HypothesisLimits(*(np.append(of_time, of_p[beam.places]) for of_time, of_p in pairs))
 
     def build_table(self, kept: Sequences, children: Children, chosen: Integers) -> Integers:
         """Return the table of children for the engine; `chosen` are the records of the hypotheses that were kept."""
+        # The first B rows are the parents themselves, which keep slot -1: they have no birth. A birth's slot is the
+        # number of switches before it.
         B, table = len(kept.mode), self.steps[kept.mode[children.parent], children.mode]
         table[:, PARENT], table[B:, SLOT] = chosen[children.parent], children.switches[B:] - 1
         return table
@@ -483,8 +504,11 @@ class Pass:
         names, t0, tf = [], float(beam.times[0]), float(beam.times[-1])
         for k, N in enumerate(kept.switches.tolist()):
             at = kept.modes[k, : N + 1]
+            # Times move one by one with the linear model, and may pass each other or leave a mode less than its
+            # shortest duration.
             times[k, :N] = keep_apart(times[k, :N], self.rules.shortest[at], t0, tf)
             names.append(tuple(beam.modes[mode] for mode in self.rules.modes[at].tolist()))
+        # Bounds of a time come last: a fixed transition, whose limits are equal, stays exactly where it is.
         times = np.clip(times, *beam.limits.T)
         is_born = np.arange(S) < kept.switches[:, None]
         d[:, :S] = np.where(is_born, times - before, 0.0)
@@ -510,6 +534,8 @@ def prepare(problem: Problem, e: int, library: Library | None = None, grid: floa
     given order of modes. It raises ValueError as `Beam` does.
     """
     known: dict[Any, Beam] = problem.__dict__.setdefault("beams", {})
+    # All of the library that tracing depends on. The modes with which a sequence begins and ends, and how long each
+    # lasts, are rules of a pass.
     key: Any = e, grid, library and (library.modes, tuple(library.successions.items()), library.max_switches)
     if key not in known:
         known[key] = Beam(problem, e, library, grid)

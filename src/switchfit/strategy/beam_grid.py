@@ -25,6 +25,7 @@ def choose_grid(run: Experiment) -> float:
     """Return the time between births: that between samples, but at most `MOST_GRID_INTERVALS` in the horizon."""
     shortest = (run.end - run.t0) / MOST_GRID_INTERVALS
     gaps = [np.diff(item.times) for item in run.measurements]
+    # The median: one gap in a log, or two samples that are close by, is not how often it measures.
     usual = [float(np.median(gap)) for gap in gaps if len(gap)]
     return max([shortest, *([min(usual)] if usual else [])])
 
@@ -39,6 +40,8 @@ def keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) ->
     """Return transition times in order, moved as far as modes with these shortest durations (N + 1,) need."""
     ahead, behind = np.cumsum(shortest[:-1]), np.cumsum(shortest[:0:-1])[::-1]
     low, high = t0 + ahead, tf - behind
+    # With the durations taken off, "in order and far enough apart" is "ascending": one pass forward moves times later,
+    # one backward from tf moves them earlier. Each moves no time that has room.
     later = np.maximum.accumulate(np.maximum(times, low) - ahead) + ahead
     return np.minimum.accumulate((np.minimum(later, high) + behind)[::-1])[::-1] - behind
 
@@ -46,6 +49,7 @@ def keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) ->
 def build_mesh(run: Experiment, grid: float, marks: FloatArray | Sequence[float] = ()) -> Mesh:
     """Return the mesh with all required nodes, the times of jumps and `marks`; no cell is longer than the grid."""
     nodes = np.unique(np.concatenate([Mesh.of(run).times, run.jump_times, marks]))
+    # A cell that is the grid but for rounding is not cut in two.
     counts = np.maximum(np.ceil(np.diff(nodes) / grid - 1e-9), 1).astype(int)
     ends = zip(nodes[:-1].tolist(), nodes[1:].tolist(), counts.tolist(), strict=True)
     inside = [np.linspace(begin, end, count + 1)[1:-1] for begin, end, count in ends]
@@ -55,6 +59,7 @@ def build_mesh(run: Experiment, grid: float, marks: FloatArray | Sequence[float]
 def choose_stops(times: FloatArray, grid: float, marks: FloatArray | Sequence[float] = ()) -> NDArray[np.intp]:
     """Return the nodes of births, `marks` and those nearest to an even grid, between the first and the last node."""
     wanted = np.arange(times[0] + grid, times[-1] - 0.5 * grid, grid)
+    # The node nearest to each wanted place, on either side: no node is added for a birth, since each costs a step.
     after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
     nearest = after - (wanted - times[after - 1] < times[after] - wanted)
     return np.unique(np.concatenate([[0], nearest, np.searchsorted(times, marks).astype(np.intp), [len(times) - 1]]))

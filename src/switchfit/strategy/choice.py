@@ -104,10 +104,13 @@ def find_best_fit(
             only_few = (
                 best.status is Status.MAX_ITERATIONS and max_iterations < MOST_ITERATIONS_BY_DEFAULT
             )  # were asked for
+            # Who asks for a certain Hessian or for few iterations wants to see what that fit does, and no other one.
             is_over = hessian != "auto" or only_few
             if not is_over and is_enough(problem, best):
                 with limit_searches():
                     others, rivals = find_other_minima(best)
+                # A minimum that is deep, or that no beam can doubt, is left for a lower one near by alone; others are
+                # searched for in full.
                 only_others = not is_shallow(problem, best) or bool(explain_no_beam(problem))
                 is_over = only_others and not others
         if best is not None and is_over:
@@ -116,6 +119,7 @@ def find_best_fit(
         search = Search(problem, best, begin, strategy, fit, began, line, others, rivals, only_others)
         search.has_budget = budget is not None
         search.run(limit_searches)
+        # No search has found a start either: what was wrong with the guess says more than that.
         if failure is not None and search.best is None:
             raise failure
         return search.finish()

@@ -50,11 +50,14 @@ def find_far_minima(
     """
     problem, found, close = evaluator.problem, [], []
     runs = range(len(problem.experiments))
+    # The lowest dips of all runs together: each takes a few models, and a run without a second minimum shall take none.
     dips = sorted((cost, e, interval) for e in runs for cost, interval in _scan(evaluator, e, theta, errors))[:DIPS]
     intervals = [[interval for _, run, interval in dips if run == e] for e in runs]
     places = [place for each in intervals for place, _, _ in each]
     hops = list_hops(evaluator, theta, intervals, errors > 0.0, MATRICES)
     for place, (lowest, start, find_lowest) in zip(places, hops, strict=True):
+        # A model made far from its minimum errs; each further one is made about the minimum of the last, until it is
+        # right, or J itself is lower.
         least = np.inf
         for _ in range(MODELS_OF_DIP):
             point = make_feasible(problem, start)
@@ -63,6 +66,7 @@ def find_far_minima(
                 found.append((there, point))
             if there < least:
                 least, best = there, point
+            # `not >` rather than `<=`: J that is no number ends the dip as well.
             # A model that is right and not lower than the cost has nothing to tell.
             if not there > cost or abs(there - lowest) < MODEL_RIGHT * (lowest - cost):
                 break
@@ -83,11 +87,15 @@ def _scan(
     ends = run.ends_of_modes(np.where(where >= 0, theta[where], run.initial_times))
     step, here = SCAN_STEP * (ends[-1] - ends[0]), evaluator.engines[e].cost(*problem.vectors(theta, e))
     for i, place in enumerate(where.tolist()[: len(ends) - 2]):  # without a free tf
+        # Nearer than that, J is still the parabola of the minimum at theta. A time at a kink has no standard error: its
+        # scan begins with a whole step.
         nearest = SCAN_FIRST * errors[place] or step
         for end in (ends[i], ends[i + 2]):
             room, far = abs(end - theta[place]), [nearest]
             if place < 0 or not nearest < room:
                 continue
+            # Distances grow by the ratio, which shows minima that are alike (`SCAN_RATIO`), up to the step, since
+            # others are narrow.
             while far[-1] < room:
                 far.append(far[-1] + min((SCAN_RATIO - 1.0) * far[-1], step))
             times, count = theta[place] + np.copysign(far[:-1], end - theta[place]), len(far) - 1
@@ -97,6 +105,8 @@ def _scan(
                 moved[place] = t
                 check_time()
                 costs[j] = evaluator.engines[e].cost(*problem.vectors(moved, e))
+            # A dip: J falls to a place, and does not fall from it to the next. The last place may be one, whose
+            # interval ends at the neighbouring transition.
             falls = np.append(costs[1:] < costs[:-1], False)
             for j in np.flatnonzero(falls[:-1] & ~falls[1:]).tolist():
                 low, high = sorted((times[j], times[j + 2] if j + 2 < count else end))

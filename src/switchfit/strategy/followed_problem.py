@@ -40,6 +40,7 @@ def soften(problem: Problem) -> Problem:
     def soften(run: Experiment, item: Measurements) -> Measurements:
         if item.sigma is None or item.sigma_names:
             return item
+        # Never less than it was: a channel that hardly varies keeps its sigma.
         return replace(item, sigma=np.maximum(item.sigma, SOFTER_DEVIATIONS * np.nanstd(item.values, axis=0)))
 
     return _replace_measurements(fix_delays(problem), soften)

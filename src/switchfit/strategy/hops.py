@@ -41,6 +41,7 @@ def hop_over_samples(problem: Problem, best: End, known: Evaluator | None = None
     if evaluator is None:
         return best._replace(evaluations=0)
     for _ in range(HOPPING_ROUNDS):
+        # The first start that lowers J begins the next round: the others were chosen about a minimum that is left now.
         for start in choose_hops(evaluator, best.theta, best.cost):
             end = fit_briefly(problem, make_feasible(problem, start), evaluator=evaluator)
             evaluations += end.evaluations
@@ -75,6 +76,7 @@ def choose_hops(
         The first that leads to a minimum is that of a model. Of all hops of a beam the exact one alone leads lower.
     """
     unknowns = evaluator.problem.unknowns
+    # The distance of a time from the nearer end of an interval.
     far = np.full(len(theta), np.inf) if reach is None else reach
     intervals = [
         [
@@ -86,6 +88,8 @@ def choose_hops(
     ]
     movable = np.ones(len(theta), bool) if free is None else free
     hops = list_hops(evaluator, theta, intervals, movable, matrices)
+    # First models rank intervals, second ones decide: that about the middle of an interval errs, and may be above J
+    # where a fit ends below it (`DOUBTED`).
     near = sorted(hops, key=lambda hop: hop[0])[:MOST_SECOND_MODELS]
     again = [find_lowest(start) for lowest, start, find_lowest in near if lowest < cost + DOUBTED * abs(cost)]
     return [start for lowest, start in sorted(again, key=lambda hop: hop[0]) if is_lower(lowest, cost)]
@@ -113,6 +117,8 @@ def _list_intervals(
     """Yield the place of a time in theta, and the ends of an interval near by in which it may be."""
     ends = run.ends_of_modes(np.where(where >= 0, theta[where], run.initial_times))
     for i, place in enumerate(where.tolist()[: len(ends) - 2]):  # without a free tf
+        # The interval in which the time is has j = k. It is left out, since the fit has been there; so are intervals
+        # whose middle is beyond a neighbouring transition.
         k = int(np.searchsorted(nodes, theta[place], "right")) - 1
         for j in range(max(k - FURTHEST, 0), min(k + FURTHEST, len(nodes) - 2) + 1):
             low, high = nodes[j], nodes[j + 1]

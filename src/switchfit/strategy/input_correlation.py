@@ -75,9 +75,13 @@ def correlate(z: FloatArray, u: FloatArray, lags: int) -> float:
     """
     if len(z) < FEWEST_RESIDUALS:
         return np.nan
+    # Lags 0 ... `lags` of the input before each residual: a model that misses how an input acts leaves its trace there,
+    # and not ahead of it.
     Phi = np.stack([u[lags - k : len(u) - k] for k in range(lags + 1)], axis=1)
     Phi = Phi - Phi.mean(axis=0)
     left, size, _ = np.linalg.svd(Phi, full_matrices=False)
+    # A slow input is nearly the same at all lags, and a constant one at its mean 0: directions of rounding are no
+    # degrees of freedom.
     kept: NDArray[np.bool_] = size > 1e-8 * max(float(np.abs(u).max(initial=0.0)), 1e-300) * np.sqrt(len(u))
     if not kept.any():
         return np.nan

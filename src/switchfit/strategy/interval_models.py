@@ -48,9 +48,12 @@ def list_hops(
     if not any(intervals):
         return
     unknowns, whole = evaluator.problem.unknowns, evaluator(theta)
+    # Unknowns at a bound stay there: an unbounded quadratic model would lead outside.
     free = free & (unknowns.lower < theta) & (theta < unknowns.upper) & ~evaluator.problem.is_sigma
     for e, listed in enumerate(intervals):
         here = _evaluate_run(evaluator, e, theta) if listed else whole
+        # One evaluation of the whole and one of the run at theta serve all intervals of the run; each adds one of the
+        # run alone.
         for place, low, high in listed:
             model = partial(_find_lowest, evaluator, e, whole, here, theta, free, matrices, place, low, high)
             middle = theta.copy()
@@ -77,14 +80,20 @@ def _find_lowest(
     """
     check_time()
     own, mine = evaluator.problem.own_places[e]
+    # At the upper end of an interval J has another derivative on the side of the next sample: it has to be that from
+    # inside.
     side, away = 1 if point[place] < high else -1, (theta - point)[mine]
     for matrix in matrices:
         there = _evaluate_run(evaluator, e, point, side, matrix)
         if not np.isfinite(there.hessian).all():
             break
         curvature = there.hessian[own[:, None], own]
+        # The model of the run is about `point`, that of all else about theta; with away = theta - point, both are
+        # written about theta: J, g and H of the run are moved there by its own quadratic model, g + H away.
         cost = whole.cost - here.cost + there.cost + (there.gradient[own] + 0.5 * curvature @ away) @ away
         gradient, hessian = whole.gradient.copy(), whole.hessian.copy()
+        # Two names of a run may be one unknown of the problem: `add.at` adds both, where an indexed sum would keep the
+        # last.
         np.add.at(gradient, mine, (there.gradient - here.gradient)[own] + curvature @ away)
         np.add.at(hessian, (mine[:, None], mine), curvature - here.hessian[own[:, None], own])
         inside = INSIDE_INTERVAL * (high - low)  # where a reset map acts, J at the end is that of the next interval
@@ -108,6 +117,7 @@ def minimize_quadratic(
     """Return the lowest value of a quadratic model with the unknown at `place` between two values, and the step (d,);
     None if it has no minimum.
     """
+    # A Cholesky factorisation tells at once whether the model has a minimum, and gives the step.
     step, places = np.zeros(len(gradient)), np.flatnonzero(free | (np.arange(len(free)) == place))
     factor, step[places], failed = lapack.dposv(hessian[places[:, None], places], -gradient[places])
     if failed:
@@ -115,6 +125,7 @@ def minimize_quadratic(
     if not low <= step[place] <= high:
         # Along the way on which the others follow the unknown to its limit.
         away, is_it = np.clip(step[place], low, high) - step[place], places == place
+        # Column of H^-1 for the unknown at `place`, scaled so that this moves by 1: how all others follow it.
         along = lapack.dpotrs(factor, is_it.astype(float))[0]
         step[places] += along * (away / along[is_it])
     return float((gradient + 0.5 * hessian @ step) @ step), step

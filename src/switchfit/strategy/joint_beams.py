@@ -27,6 +27,7 @@ class Beams:
     def __init__(self, problem: Problem, own: Sequence[NDArray[np.intp]]) -> None:
         self.problem, self.own = problem, own
         places, times = np.unique(np.concatenate(own), return_counts=True)
+        # Only what two runs or more have is passed on; private parameters follow from a run's own data.
         self.shared, self.first = places[times > 1], int(problem.unknowns.is_time.sum())
         E, s = len(own), len(self.shared)
         self.matrices, self.slopes = np.zeros((E, s, s)), np.zeros((E, s))  # of b'q - q'A q / 2
@@ -56,8 +57,12 @@ class Beams:
                 moved[own] = best.parameters[own]
                 if best.evidence is not None:  # what the data of the run say about shared parameters
                     mine, at = self._locate(e)
+                    # Private parameters of the run are eliminated (a Schur complement): they follow the shared ones at
+                    # their best.
                     center, g, Q = best.evidence.restrict(mine)
                     self.matrices[e][np.ix_(at, at)], self.slopes[e][at] = Q, Q @ center - g
+        # What the last run has left there is its own opinion; all of them together, with the priors, say where to go
+        # on.
         moved[self.shared] = self.combine(q)[self.shared]
         return found, moved
 
@@ -67,12 +72,15 @@ class Beams:
         """
         if not all(found):
             return []
+        # Runs times proposals, not all combinations: these grow as the product over the runs.
         best = [proposals[0] for proposals in found]
         others = [[*best[:e], other, *best[e + 1 :]] for e, own in enumerate(found) for other in own[1:]]
         return [self._join(chosen, q.copy()) for chosen in (best, *others)]
 
     def _join(self, chosen: Sequence[Proposal], moved: FloatArray) -> Proposal:
         for own, proposal in zip(self.own, chosen, strict=True):
+            # Shared parameters of single proposals differ from run to run; q has the one value that all of them agree
+            # on.
             private = np.setdiff1d(own, self.shared)
             moved[private] = proposal.parameters[private]
         sequences = tuple(proposal.sequences[0] for proposal in chosen)
@@ -92,8 +100,11 @@ class Beams:
         if not len(self.shared):
             return None
         mine, at = self._locate(e)
+        # Without the run's own part, which its data will say again: evidence that counts twice makes the beam too sure
+        # of where it was.
         A, b = self.matrices.sum(0) - self.matrices[e], self.slopes.sum(0) - self.slopes[e]
         lowest = _solve(A, b, q[self.shared])
+        # Shared parameters that this run does not have are free to follow.
         curvature = Quadratic(lowest, np.zeros(len(A)), A).restrict(at).Q
         center, Q = q[self.own[e]], np.zeros((len(self.own[e]),) * 2)
         center[mine], Q[np.ix_(mine, mine)] = lowest[at], curvature
@@ -105,6 +116,7 @@ class Beams:
         """
         unknowns, places, moved, near = self.problem.unknowns, self.first + self.shared, q.copy(), q[self.shared]
         _, g, h = PriorTerms(*(values[places] for values in unknowns.priors)).evaluate(near, gauss_newton=True)
+        # What runs say costs q'A q / 2 - b'q, the priors g'd + d'h d / 2 with d = q - near: (A + h) q = b + h near - g.
         solved = _solve(self.matrices.sum(0) + np.diag(h), self.slopes.sum(0) + h * near - g, near)
         moved[self.shared] = np.clip(solved, unknowns.lowest[places], unknowns.upper[places])
         return moved

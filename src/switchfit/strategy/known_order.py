@@ -68,6 +68,8 @@ def find_times(problem: Problem, theta: FloatArray, is_enough: Callable[[float],
         Asked after each fit whether its J is low enough to end the search.
     """
     best = _find_times(problem, theta, fix_delays(problem), is_enough)
+    # A reset of the state at a wrong time puts the samples after it far off, and hypotheses that are nearly right are
+    # lost. A log with more noise forgives that (`soften`).
     if not any(structure.has_resets for structure in problem.structures) or is_enough(best.cost):
         return best
     other = _find_times(problem, theta, soften(problem), is_enough)
@@ -83,6 +85,7 @@ def _find_times(problem: Problem, theta: FloatArray, followed: Problem, is_enoug
         for again in range(MOST_PASSES):
             follow = partial(_follow_run, followed, beams, is_fitted=again > 0)
             found, q = beams.follow(best.theta[beams.first :], follow, settled)
+            # Times of the best proposal of each run; of settled runs, which propose nothing, those of the last fit.
             moved = np.append(best.theta[: beams.first], q)
             for where, proposals in zip(problem.unknowns.times, found, strict=True):
                 for proposal in proposals[:1]:
@@ -91,6 +94,7 @@ def _find_times(problem: Problem, theta: FloatArray, followed: Problem, is_enoug
             evaluator = prepare_meshes(problem, start, evaluator)
             end = End(start, np.inf, 0) if evaluator is None else fit_briefly(problem, start, evaluator=evaluator)
             evaluations += end.evaluations
+            # `best` begins at infinity, of which no part can be taken off.
             is_lower = end.cost < best.cost - LOWER * abs(best.cost) if np.isfinite(best.cost) else not end.failed
             best = end if is_lower else best
             settled = _list_settled(followed, beams, found, end) if len(found) > 1 else set()
@@ -106,6 +110,7 @@ def _follow_run(
     problem: Problem, beams: Beams, e: int, q: FloatArray, evidence: Quadratic | None, *, is_fitted: bool
 ) -> list[Proposal]:
     """Return the proposals of one run, from parameters q (P,) that are or are not those of a fit."""
+    # A run without evidence has a matrix of zeros still.
     followed = np.any(beams.matrices, axis=(1, 2)).sum()  # runs that have said something about shared parameters
     if not len(beams.shared) or (not is_fitted and followed < RUNS_BEFORE_COMBINING):
         return follow_order(problem, e, q, evidence, REPLAYS_OF_ORDER)

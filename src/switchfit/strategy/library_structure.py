@@ -41,6 +41,7 @@ def trace_transition(problem: Problem, run: Experiment, pair: tuple[str, str]) -
     has_cost = any(isinstance(item, TransitionCost) for item in run.data)
     if not (has_cost or pair in problem.system.reset_maps or pair in problem.system.guards):
         return None, None, None
+    # Each transition is traced in an experiment of its two modes alone, whatever the sequence of the run is.
     alone = replace(run, mode_sequence=pair, transition_times=None, jumps=())
     found = trace_structure(problem._sources, alone, 1)
     return found.reset_maps[0], found.transition_costs[0], found.guards[0]
@@ -77,6 +78,7 @@ def trace_library(
     for place, here in traced:
         for table, functions, function in zip(tables, known, here, strict=True):
             if function is not None:
+                # Equal functions are compiled once: a reset that all transitions share has one place.
                 functions += [] if function in functions else [function]
                 table[place] = functions.index(function)
     reset_maps, transition_costs, guards = map(tuple, known)

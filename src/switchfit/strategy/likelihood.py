@@ -30,6 +30,7 @@ def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comp
         r = comparison.residuals[there]
         sigma = np.ones(len(r)) if comparison.sigma is None else comparison.sigma[there]
         u = (r / sigma) ** 2
+        # J leaves the constants out; models with other sigmas are compared with them.
         total -= float(np.log(sigma).sum())
         squares += float(u.sum())
         count += len(r)

@@ -74,6 +74,7 @@ def try_starts(
        Math. Program. 37 (1987) 59-80.
     """
     ends, ended = [], "most"
+    # The first of them is the problem's guess, from which the fit before has begun: its end stands there instead.
     starts = np.vstack([theta, draw_starts(problem, most, seed)[1:]])
     try:
         for start in starts:
@@ -101,6 +102,8 @@ def _is_enough(costs: FloatArray) -> bool:
     if n == 0:
         return False
     ascending = np.sort(costs)
+    # Minima are told apart by J alone: two with the same J would be one, which only ends the search a little earlier.
     w = 1 + int(np.sum(np.diff(ascending) > SAME_COST * np.abs(ascending[1:])))
     found = int(np.sum(ascending <= ascending[0] + SAME_COST * abs(ascending[0])))
+    # w (n - 1) / (n - w - 2) is the expected number of minima ([1] of `try_starts`); only for n > w + 2 is it one.
     return found > AGREEING_ENDS and n > w + 2 and w * (n - 1) / (n - w - 2) < w + 0.5

@@ -34,6 +34,8 @@ def is_minimum_time(problem: Problem, fit: Fit) -> bool:
         return False
     place, first = int(where[-1]), fit.history[0]
     rate = float(fit.gradient[place])
+    # J is the clock if it depends on tf alone, with one rate at the start and at the end; a running cost of 1 looks the
+    # same as a terminal one of tf.
     others = np.delete(fit.gradient, place)
     pairs = ((fit.cost, fit.theta[place]), (first.cost, first.theta[place]))
     proportional = all(abs(cost - rate * (tf - run.t0)) <= SAME_RATE * abs(cost) for cost, tf in pairs)
@@ -48,6 +50,8 @@ def try_shorter_horizons(problem: Problem, fit: Fit) -> Starts:
     end = End(fit.theta, np.inf if fit.violated else fit.cost, 0)
     evaluations, tried, seed = 0, 0, 0
     while True:
+        # A random start over a horizon that is far too long is nowhere near an end that meets the constraints: it
+        # shrinks with each better end.
         given = problem if end.failed else _shorten_horizon(problem, end.theta)
         found = try_starts(given, end.theta, seed=seed, most=STARTS_UNTIL_FEASIBLE if end.failed else MOST_STARTS)
         evaluations, tried, seed = evaluations + found.end.evaluations, tried + len(found.costs), seed + 1

@@ -46,6 +46,7 @@ def find_other_minima(fit: JudgedFit) -> tuple[list[FloatArray], tuple[Rival, ..
         hops += look_near(evaluator, theta, cost - LEAST_GAIN_OF_MINIMUM * scale, errors)
         if not hops and not evaluator.problem.constraint_names:
             hops = look_beyond_corners(evaluator, theta, cost - LEAST_GAIN_OF_MINIMUM * scale, fit.held_covariance)
+        # A start that leads lower ends this minimum, and with it the question which others are as good.
         for place, point in [] if hops else close:
             end = fit_briefly(evaluator.problem, point, RIVAL_ITERATIONS, evaluator)
             if is_lower(end.cost, cost):

@@ -36,8 +36,12 @@ def build_other_problem(estimate: JudgedFit, other: Any) -> Problem:
     for name, parameter in given.parameters.items():
         if name in estimate.parameters:
             value = estimate.parameters[name]
+            # The other problem may have bounds of its own, which the fitted value does not know: they are widened to
+            # hold it.
             bounds = {"lower": np.minimum(parameter.lower, value), "upper": np.maximum(parameter.upper, value)}
             held = parameter.fixed or name in estimate.fixed
+            # The prior is in the fitted value already; counted again it would pull the prediction, and chi-square would
+            # count it.
             parameter = replace(parameter, value=value, **bounds, prior=None, fixed=held)
         parameters[name] = parameter
     return replace(given, experiments=runs, parameters=parameters)
@@ -47,6 +51,7 @@ def _build_experiment(estimate: JudgedFit, problem: Problem, other: Any) -> Expe
     """Return the only experiment of a fit with the data of another log."""
     run, given = problem.experiments[0], list(other) if isinstance(other, (list, tuple)) else [other]
     items = run.measurements
+    # A pandas table has columns too, but no times: for that there is no way to know which column counts them.
     is_log = list_columns(other) is not None and hasattr(other, "times")
     if not is_log and not (given and all(isinstance(item, Measurements) for item in given)):
         raise TypeError(
@@ -64,7 +69,10 @@ def _build_experiment(estimate: JudgedFit, problem: Problem, other: Any) -> Expe
         raise ValueError(f"the fit has {len(items)} Measurements; got {len(given)} for the other run.")
     data = _count_dates([_complete(new, item) for new, item in zip(given, items, strict=True)], run)
     first, last = min(item.seen_times[0] for item in data), max(item.times[-1] for item in data)
+    # A horizon that came from the data of the fit comes from these data; one that was given stays.
     t0 = first if "t0" in run.taken_from_data else run.t0
+    # The other run has transition times of its own, estimated from its data: those of the fit are no more than a guess,
+    # and where they do not lie inside the new horizon, even spaces are one.
     times = estimate.transition_times[0]
     if np.any(np.diff([t0, *times, last]) <= 0):
         times = np.linspace(t0, last, len(run.mode_sequence) + 1)[1:-1]
@@ -83,6 +91,7 @@ def _count_dates(data: list[Measurements], run: Experiment) -> list[Measurements
             "the other log has dates, and the times of the fit are numbers: give validate an sf.Experiment, whose "
             "origin says at which date its times are 0."
         )
+    # Times of both logs count from the same date, so that a guess of a transition means the same moment.
     counted = data if run.origin is None else [count_from(item, run.origin, run.time_unit) for item in data]
     if dated and "t0" not in run.taken_from_data and min(item.times[0] for item in counted) > run.end:
         raise ValueError(
@@ -113,9 +122,12 @@ def _complete(new: Measurements, like: Measurements) -> Measurements:
             f"the Measurements of the fit have {like.values.shape[1]} channels, those of the other run "
             f"{new.values.shape[1]}."
         )
+    # What a log does not say about its sensor is that of the sensor in the fit; it is the same instrument on another
+    # day.
     names = ("sigma", "observe", "names", "units")
     left_out = {name: getattr(like, name) for name in names if getattr(new, name) is None}
     if "sigma" in left_out:
+        # One sigma a sample belongs to those samples, of which the other run has others.
         if isinstance(like.sigma, np.ndarray) and like.sigma.ndim == 2:
             raise ValueError(
                 "sigma differs from sample to sample in the fit: give the Measurements of the other run their "

@@ -34,6 +34,7 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
 
     unknowns = problem.unknowns
     sobol = qmc.Sobol(len(unknowns.names), seed=seed)
+    # A power of two, for which the points of a Sobol sequence are balanced.
     cube = sobol.random(1 << max(count - 1, 0).bit_length())[:count]
     low, high, log = _compute_ranges(problem)
     points = low + cube * (high - low)
@@ -44,6 +45,7 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
         for begin, end, group in _list_stretches(experiment, where):
             # Sorted uniform numbers are uniform over all ordered times; minimum durations are added to their gaps.
             room = end - begin - (len(group) + 1) * shortest
+            # Sorted uniform numbers are uniform over all orders of times: no start is lost to times in a wrong order.
             ordered = np.sort(cube[:, group], axis=1)
             if unknowns.log[group].all():
                 first = unknowns.initial[group[0]] - experiment.t0

@@ -55,6 +55,7 @@ def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
     with suppress(OutOfTimeError):
         for repeated in range(REINSERTIONS):
             show_detail(f"round {repeated + 1}", best.cost)
+            # Greedy: the first move whose fit ends lower is taken. All others would have to be rated anew after it.
             for start, tried in _list_starts(problem, best.theta):
                 end = fit_briefly(problem, start)
                 evaluations += tried + end.evaluations
@@ -69,9 +70,12 @@ def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
 def _list_moves(sequence: tuple[str, ...]) -> Iterator[tuple[int, int]]:
     """Yield a segment that may be removed, and one behind which it may be inserted without changing the sequence."""
     for i in range(len(sequence) - 2):
+        # A mode between two equal ones: without it these are one stretch, and two transitions are free for another
+        # place.
         if sequence[i] == sequence[i + 2]:
             rest = sequence[: i + 1] + sequence[i + 3 :]
             for j in range(len(rest)):
+                # Put inside stretch j. Only where this gives the sequence again are theta and its unknowns the same.
                 whole = (*rest[: j + 1], sequence[j + 1] if j + 1 < len(sequence) else "", rest[j], *rest[j + 1 :])
                 if whole == sequence and len(rest) > 1:
                     yield i, j
@@ -83,6 +87,7 @@ def _list_starts(problem: Problem, theta: FloatArray) -> Iterator[tuple[FloatArr
     """
     evaluator = Evaluator(problem, theta)
 
+    # Where the model cannot be integrated J is no number, which would compare with nothing.
     def evaluate(at: FloatArray) -> float:
         return float(np.nan_to_num(evaluator.cost(at), nan=np.inf))
 
@@ -90,6 +95,7 @@ def _list_starts(problem: Problem, theta: FloatArray) -> Iterator[tuple[FloatArr
         if run.has_free_tf or np.any(where < 0):  # a fixed transition stays where it is, and with it the others' order
             continue
         moves = set(_list_moves(run.mode_sequence))
+        # The mode closed to no length in the middle of its place: what its removal costs, before anything follows.
         closed = {i: evaluate(_move_pair(theta, where, i, i, *[theta[where[i : i + 2]].mean()] * 2)) for i, _ in moves}
         for i in sorted(closed, key=closed.__getitem__)[:REMOVALS]:
             others = np.delete(theta[where], [i, i + 1])
@@ -99,9 +105,12 @@ def _list_starts(problem: Problem, theta: FloatArray) -> Iterator[tuple[FloatArr
                 if (i, j) in moves:
                     check_time()
                     pair = _move_pair(theta, where, i, j, begin, begin)
+                    # dJ/d(end) of a mode of no length that begins here: the insertion rate. It costs one gradient a
+                    # place, and no fit.
                     rates.append((evaluator(pair).gradient[where[j + 1]], begin, j))
             rate, begin, j = min(rates, default=(0.0, 0.0, 0))
             if rate < 0:
+                # The rate says in which direction, not how far: J at a few lengths does.
                 room = np.append(others, run.end)[j] - begin
                 starts = [_move_pair(theta, where, i, j, begin, begin + part * room) for part in INSERTION_LENGTHS]
                 yield min(starts, key=evaluate), len(closed) + len(rates) + len(starts)

@@ -109,6 +109,7 @@ class Search:
             strategies = [] if self.only_others else self._list_strategies()
             with limit_searches():
                 for name, find in strategies:
+                    # The order is that of the cost, and each strategy begins where the best so far is.
                     if is_late() or not self._try(name, find):
                         break
                 self._leave_minimum()
@@ -136,6 +137,7 @@ class Search:
             raise ValueError("nothing was found.")
         starts = None
         if self.starts is not None:
+            # Short fits have meshes of their own, whose J differs from that of the best by the integration error.
             accuracy = max(self.problem.rtol * abs(best.cost), self._compute_margin(best.cost))
             agreeing = self.starts.count_agreeing(best.cost, accuracy)
             starts = len(self.starts.costs), 0, agreeing  # the lowest of them is what `best` began at
@@ -175,6 +177,8 @@ class Search:
             if not starts and self.best is not None and is_enough(self.problem, self.best, self.steps):
                 starts, self.rivals = find_other_minima(self.best)
             before = self.lowest
+            # The first start that leads lower is enough: the others were found beside a minimum that is not the best
+            # any more.
             for start in starts:
                 if not is_late() and self.lowest == before:
                     self._try(BY_OTHER_MINIMUM, partial(fit_briefly, self.problem), make_feasible(self.problem, start))
@@ -197,6 +201,7 @@ class Search:
         """Return whether J of an end is lower than that of the best; no J is lower than one whose constraints are
         violated: that says nothing.
         """
+        # inf - inf is no number: without a best so far, any finite J is lower.
         return self.lowest == np.inf > cost or cost < self.lowest - self._compute_margin(self.lowest)
 
     def _compute_margin(self, cost: float) -> float:
@@ -218,9 +223,12 @@ class Search:
         try:
             end = find(known if start is None else start)
             evaluations = end.evaluations
+            # A short fit ends at a loose tolerance; only an end that is lower is worth the full one.
             if self._is_lower(end.cost):
                 fit = self.fit(end.theta, f"{name}, fit of its end", np.nan_to_num(self.first_cost))
                 evaluations += fit.evaluations
+                # Asked of the full fit again: on its own meshes it may not be lower, and what it meets may violate
+                # constraints.
                 if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
                     self.best = fit
         except OutOfTimeError:

@@ -53,9 +53,13 @@ class Rules(NamedTuple):
         """Return the rules of a library."""
         allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
         shortest = np.array([library.durations[mode] for mode in modes])
+        # Row n: the modes from which one of `last` can be reached within n more switches. A hypothesis that cannot end
+        # as it must any more would take room until the last stop.
         ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
         begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
         follows = np.zeros((len(ends), *allowed.shape), dtype=bool)
+        # A birth after s switches leaves most - s - 1: the rows of `ends` from the last but one back. After `most` none
+        # follows.
         follows[:-1] = allowed & ends[-2::-1, None]
         return cls(np.arange(len(modes)), shortest, begins, ends[0], follows, None)
 
@@ -63,6 +67,7 @@ class Rules(NamedTuple):
     def of_order(cls, modes: Integers, shortest: FloatArray, between: FloatArray) -> Rules:
         """Return the rules of a given order of modes (N + 1,), each of which lasts at least some time."""
         count = len(modes)
+        # From each place to the next one only. Places are not modes: a mode that occurs twice has two of them.
         follows = np.repeat(np.eye(count, k=1, dtype=bool)[None], count, axis=0)
         return cls(modes, shortest, np.zeros(1, dtype=np.int64), np.arange(count) == count - 1, follows, between)
 
@@ -70,10 +75,13 @@ class Rules(NamedTuple):
         """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
         may_leave = t - kept.last >= self.least[kept.mode]
         if self.between is not None and self.between.size:
+            # A hypothesis at the last place has no switch left; the index is clipped for it, and `follows` lets none
+            # through.
             earliest, latest = self.between[:, np.minimum(kept.switches, self.between.shape[1] - 1)]
             may_leave &= (earliest < t) & (t < latest)
         may_enter = t + self.shortest <= end
         K = len(self.modes)
+        # One `take` from a flat table instead of two index arrays: this stands in the loop over all stops.
         follows = self.follows.reshape(-1, K).take(kept.switches * K + kept.mode, axis=0)
         parents, after = (follows & may_leave[:, None] & may_enter).nonzero()
         return parents, after
@@ -139,6 +147,7 @@ class Sequences(NamedTuple):
         """Return the chosen ones of their children; births were at t."""
         parent, mode, switches = children.parent[chosen], children.mode[chosen], children.switches[chosen]
         modes, times, last = self.modes.take(parent, axis=0), self.times.take(parent, axis=0), self.last[parent]
+        # Children are listed after all that go on (`list_children`), so that the position alone says which are births.
         born = (chosen >= len(self.mode)).nonzero()[0]
         slot = switches[born]
         modes[born, slot], times[born, slot - 1], last[born] = mode[born], t, t
@@ -149,6 +158,7 @@ def encode(modes: Sequence[int]) -> int:
     """Return the code of a sequence of modes."""
     code = 0
     for mode in modes:
+        # As int64 arrays wrap around, in Python's integers; the last line reads the 64 bits as a signed number.
         code = (code * HASH_MULTIPLIER + mode + 1) % 2**64
     return (code + 2**63) % 2**64 - 2**63
 
@@ -171,6 +181,7 @@ def select_lowest(
     pay everywhere, and hypotheses that have used up theirs would drive out all others.
     """
     order = value.argsort(kind="stable")
+    # What could not be integrated, or may not end here (`Pass._follow`), is no candidate.
     order = order[np.isfinite(value[order])]
     # In the order of their values; the best of each number of switches first, then the others while there is room.
     most = int(np.maximum.reduce(switches, initial=0))
@@ -189,4 +200,5 @@ def select_lowest(
                 first.append(place)
             else:
                 others.append(place)
+    # Places in `order` are ranks: sorted they give ascending values, whether they were reserved or not.
     return order[sorted(first + others[: max(width - len(first), 0)])]

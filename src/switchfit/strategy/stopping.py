@@ -47,6 +47,7 @@ def is_enough(problem: Problem, fit: JudgedFit, steps: Sequence[Step] = ()) -> b
     if not fit.status.successful:
         return False
     if len(steps) < 2:
+        # Without a time there is no schedule to search for: what the verdict says is all that can be asked.
         if not any(run.transition_times for run in problem.experiments):
             return not is_doubted(fit)
         # A verdict takes as long as many steps, and so does a beam, which finds other minima that leave nearly noise.
@@ -138,6 +139,8 @@ def is_shallow(problem: Problem, fit: JudgedFit) -> bool:
         places = problem.unknowns.times[e]
         modes = np.diff(run.ends_of_modes(np.where(places >= 0, fit.theta[places], run.initial_times)))
         for i in np.flatnonzero(places[: len(modes) - 1] >= 0).tolist():
+            # Beyond half of the shorter mode another transition is near, and one parabola about the fit says nothing. A
+            # time at a kink has no parabola at all, and is in doubt.
             half, error = 0.5 * min(modes[i], modes[i + 1]), fit.standard_errors[places[i]]
             if not error > 0.0 or not 0.5 * (half / error) ** 2 > DEEP * hidden:
                 return True

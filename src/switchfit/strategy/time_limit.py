@@ -23,6 +23,7 @@ def limit_time(
     """Let searches inside the context end after so many seconds of a clock, or with that around it, or where a
     callback, called with each iteration of their fits, returns true.
     """
+    # A limit inside another one, as of a fit in a search, ends with that around it as well.
     end, around = clock() + seconds, _is_late.get()
     token = _is_late.set(lambda: clock() > end or around())
     called = callback_of_search.set(callback or callback_of_search.get())

@@ -169,6 +169,7 @@ class Validation(Displayed):
         Parameters of the fit have the standard errors that are corrected there. Those of own unknowns are widened by
         the largest factor of these and of their own estimation, since both errors are in them.
         """
+        # Unknowns that neither fit estimated, such as a parameter that was fixed there, keep their errors: factor 1.
         known = dict(zip(self.fit.theta_names, measure_widening(self.fit), strict=True))
         widest = max((known[name] for name in self.kept if name in known), default=1.0)
         if self.refit is not None:
@@ -263,6 +264,7 @@ def validate(estimate: JudgedFit, other: Any, *, refit: Sequence[str] | None = N
     refit : sequence of str, optional
     """
     problem = build_other_problem(estimate, other)
+    # An array parameter has several entries of theta, under one name in `estimate.parameters`.
     spans = [span for name, span in problem.unknowns.parameters.items() if name in estimate.parameters]
     kept = {problem.theta_names[i]: i for span in spans for i in range(span.start, span.stop)}
     own = [name for name in problem.theta_names if name not in kept]
@@ -275,6 +277,8 @@ def validate(estimate: JudgedFit, other: Any, *, refit: Sequence[str] | None = N
         )
     theta, found = problem.initial_theta, None
     if asked:
+        # The parameters of the fit are constants while the run's own unknowns are estimated; how their error acts on
+        # these is linearised afterwards (`whiten_residuals`).
         held = [name for name in problem.theta_names if name not in asked]
         found = find_best_fit(fix_unknowns(problem, held))
         theta[np.isin(problem.theta_names, found.theta_names)] = found.theta
@@ -285,6 +289,8 @@ def validate(estimate: JudgedFit, other: Any, *, refit: Sequence[str] | None = N
     whitened = whiten_residuals(estimate, problem, sensitivities, comparisons, kept, found, noise)
     residuals, chi_square, freedom, covariance = whitened
     noise_freedom, scale = _judge_noise(estimate, problem, theta, covariance, found)
+    # Diagnostics read residuals as measured less fitted. Here these are the whitened z; and weights of a robust loss
+    # belonged to the others.
     judged = [
         [replace(c, measured=c.fitted + z, downweighted=None) for c, z in zip(run, shown, strict=True)]
         for run, shown in zip(comparisons, residuals, strict=True)
@@ -325,17 +331,22 @@ def _judge_noise(
 
     NaN if a sigma was estimated from the run itself, or as many unknowns as values.
     """
+    # F of (n, freedom of the fit): residuals are divided by the noise that the fit has found.
     if problem.is_sigma_known is False:
         return estimate.freedom, 1.0
     counts = count_values_by_sigma(problem)
     names = [name for name, count in zip(problem.theta_names, counts, strict=True) if count]
+    # A sigma that was chosen to suit these residuals makes chi-square n, whatever the model is worth.
     if refit is not None and set(names) & set(refit.theta_names):
         return np.nan, np.nan
+    # c / sigma: turns the covariance of theta into c'L c of the logarithms.
     slope = counts / np.where(counts > 0, theta, 1.0)
     variance = float(slope @ covariance @ slope) if names else 0.0
     if variance == 0:
         return np.inf, 1.0
+    # F of (n, m) has, about, the variance of z . z: m = n^2 / (2 c'L c), as in the header.
     m = sum(item.count for item in problem.measurements) ** 2 / (2 * variance)
+    # k, the unknowns of the fit besides the sigmas; a sigma with a prior has a sample of its own, and takes none.
     others = estimate.samples - estimate.freedom - sum(name not in estimate.priors for name in names)
     k = others * min(m / estimate.samples, 1.0)
     return (m - k, 1 - k / m) if m > k else (np.nan, np.nan)
@@ -361,6 +372,8 @@ def _judge_validation(found: Validation) -> Verdict:
         names = tuple(name for name in found.theta_names if name not in found.kept)
         against.append(Finding("bad", Issue("own unknowns not converged", names), ("give a better guess",)))
     is_tested = np.isfinite(found.probability)
+    # Of very many samples chi-square is unlikely for a model that is right to a per cent: it must also be clearly too
+    # large.
     too_far = (
         is_tested and found.probability < UNLIKELY_AS_NOISE and found.chi_square > (1 + CLEARLY_OFF) * found.freedom
     )
@@ -374,6 +387,7 @@ def _judge_validation(found: Validation) -> Verdict:
     labels = [label for label, own in zip(found.residuals.labels, found.residuals.correlated, strict=True) if own]
     if labels:
         against.append(Finding("doubtful", Issue("prediction errors correlated", tuple(labels))))
+    # Bonferroni: of so many tests one is unlikely by chance.
     tested = [test for test in found.inputs if test.probability < UNLIKELY_AS_NOISE / len(found.inputs)]
     if tested:
         against.append(Finding("doubtful", Issue("input not explained", tuple(t.input for t in tested))))

@@ -71,10 +71,12 @@ def whiten_residuals(
         where = np.flatnonzero(np.isin(problem.theta_names, refit.theta_names))
         Z = np.zeros((d, refit.free_basis.shape[1]))
         Z[where] = refit.free_basis
+        # Each prior of an own unknown is one more residual, each free direction one fewer.
         freedom += len(refit.priors) - Z.shape[1]
     here = [i for name, i in kept.items() if name in estimate.theta_names]
     there = [estimate.theta_names.index(problem.theta_names[i]) for i in here]
     C = np.zeros((d, d))
+    # Fixed parameters, and what is free here but was not in the fit, have no error: their rows stay 0.
     C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
     # Residuals over sigma are then no normal numbers, or their derivatives are not known. A sigma may be a parameter.
     robust = any(item.loss != "linear" for item in problem.measurements) or problem.estimates_delays
@@ -82,6 +84,7 @@ def whiten_residuals(
         return found, np.nan, freedom, np.full((d, d), np.nan)
     samples = collect_sample_derivatives(problem, sensitivities)
     sigma = noise * samples.weight**-0.5
+    # `residual` is model minus data; r of the formulas above is data minus model, so that X is the model's derivative.
     X, r = samples.derivative / sigma[:, None], -samples.residual / sigma
     if refit is not None and refit.priors:
         rows, error = _weigh_priors(problem, refit)
@@ -91,6 +94,8 @@ def whiten_residuals(
         measured = [k for k, c in enumerate(run) if c.kind == "measurements"]
         for k, item in enumerate(measured):
             own = (samples.experiment == e) & (samples.item == k)
+            # Back in the units of the data, in the places of values that are there: samples come in the order of the
+            # comparisons.
             found[e][item][np.isfinite(run[item].residuals)] = (z[: len(sigma)] * sigma)[own]
     if refit is not None:
         # The exact Hessian, as of any fit: a transition time at which the vector field does not jump has no first
@@ -117,8 +122,11 @@ def _remove_error(
         Covariance of the fitted parameters.
     """
     left, size, right = np.linalg.svd(X @ Z, full_matrices=False)
+    # A direction that moves no residual has been fitted by nothing: it takes no degree of freedom out of r.
     does = size > NEGLIGIBLE_SINGULAR_VALUE * size.max(initial=0.0)
     Q, root = left[:, does], Z @ (right[does].T / size[does])  # Z G^+ = root Q', M = I - Q Q'
+    # A root of C: half half' = C. C may be singular, as where a direction is held, with an eigenvalue below 0 by
+    # rounding.
     values, vectors = np.linalg.eigh(C)
     half = vectors * np.sqrt(np.maximum(values, 0.0))
     U = X @ half
@@ -134,6 +142,7 @@ def _weigh_priors(problem: Problem, refit: JudgedFit) -> tuple[FloatArray, Float
     where = np.flatnonzero(np.isin(problem.theta_names, refit.theta_names))
     priors = PriorTerms(*(values[where] for values in problem.unknowns.priors))
     _, g, h = priors.evaluate(refit.theta, gauss_newton=True)  # of r = g / sqrt(h), whose derivative is sqrt(h)
+    # Unknowns without a prior have h = 0.
     has, root = h > 0, np.sqrt(h[h > 0])
     rows = np.zeros((len(root), len(problem.theta_names)))
     rows[np.arange(len(root)), where[has]] = root

@@ -136,6 +136,7 @@ def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:
 
 def _find_failures(fit: Fit, smallest: float, check: DerivativeCheck) -> Iterator[Issue]:
     """Return the checks that failed."""
+    # Such a fit ended where rounding or noise of J hides any further step: its optimality may be above the tolerance.
     as_precise_as_possible = fit.status.successful and fit.status is not Status.CONVERGED
     if not as_precise_as_possible and not fit.optimality <= fit.tolerance:
         yield Issue("optimality", figures={"optimality": fit.optimality, "tolerance": fit.tolerance})

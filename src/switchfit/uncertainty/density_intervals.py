@@ -35,6 +35,7 @@ def list_resets(fit: Fit) -> list[int]:
     """Return where in theta the transition times stand at which the state jumps."""
     found: list[int] = []
     for path, places in zip(fit.trajectories, fit.transition_places, strict=True):
+        # Places in the trajectory at which a segment begins; the node before has the state before the transition.
         after = path.segments[1:-1]
         jumps = (path.states[after] != path.states[after - 1]).any(axis=1)
         found += places[jumps & (places >= 0)].tolist()
@@ -57,6 +58,8 @@ def replace_where_cost_jumps(
     found, scale, resets = intervals.copy(), fit.variance_scale, list_resets(fit)
     for own, place in zip(pieces, places.tolist(), strict=True):
         sides = [side[~np.isnan(side[:, 0])] for side in own]
+        # Without a jump between the pieces the state that jumps is not measured near by, and J behaves as for any other
+        # time.
         if place in resets and any(_find_jumps(side).max() > LEAST_JUMP * scale for side in sides):
             low, high = _find_quantiles(sides, scale, level)
             # J may be lowest at the edge of what is likely, beside a sample: the estimate is never left out.
@@ -66,9 +69,11 @@ def replace_where_cost_jumps(
 
 def _find_jumps(pieces: FloatArray) -> FloatArray:
     """Return by how much each of the pieces to a side (P, 5) begins beside where the one before it ends: (P,)."""
+    # J at the beginning of each piece, and its slope and curvature outwards: J at the end of it follows.
     start, stop, rise, slope, curvature = pieces.T
     length = np.abs(stop - start)
     ends = rise + length * (slope + 0.5 * curvature * length)
+    # The first piece begins at the estimate, where the rise is 0.
     return np.abs(rise - np.append(0.0, ends[:-1]))
 
 
@@ -82,8 +87,10 @@ def _find_quantiles(sides: Sequence[FloatArray], scale: float, level: float) -> 
         reach = find_first_root(left, slope[-1], curvature[-1]) if left > 0.0 else 0.0
         length[-1] = np.minimum(length[-1], reach)
         along = length * np.linspace(0.0, 1.0, POINTS_OF_DENSITY)
+        # Left pieces run outwards from the estimate: reversed, so that x ascends over both sides.
         values.append((start + sign * along).ravel()[::sign])
         costs.append((rise + along * (slope + 0.5 * curvature * along)).ravel()[::sign])
+    # Trapezoids over x; ends of two pieces at one x have no width between them, so that a jump adds nothing.
     x, density = np.concatenate(values), np.exp(-np.concatenate(costs) / scale)
     below = np.append(0.0, np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(x)))
     return np.interp([0.5 * (1.0 - level), 0.5 * (1.0 + level)], below / below[-1], x)

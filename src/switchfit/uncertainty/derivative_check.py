@@ -151,6 +151,7 @@ def check_derivatives(problem: Problem, theta: ArrayLike | None = None, *, paper
     require_unknowns(problem)
     at = problem.check_theta(theta)
     # The mesh of the first guess may be far too coarse elsewhere, and integration error would look like wrong adjoints.
+    # At the first guess the meshes are those of the fit, made once.
     evaluator = evaluator_of(problem) if theta is None else Evaluator(problem, at)
     return compare_derivatives(evaluator, at, paper=as_flag(paper, "paper"))
 
@@ -159,15 +160,20 @@ def compare_derivatives(evaluator: Evaluator, theta: FloatArray, *, paper: bool)
     """Return remainders of J with its gradient and Hessian along a random direction, near theta but off the nodes, and
     the gaps to the paper's equations there if these are asked for.
     """
+    # J is smooth between nodes only: across one its derivatives jump, and Taylor orders would say nothing.
     at = _move_off_nodes(evaluator, theta)
     base = evaluator(at)
+    # Every unknown takes part, changing J by about as much as the others: with one direction along an axis of large
+    # curvature, an error in the others would drown. The seed makes a check repeatable.
     direction = np.random.default_rng(0).choice([-1.0, 1.0], size=len(at)) * _choose_scales(base, at)
     largest = _find_room(evaluator, at, direction)
+    # Halved steps: a remainder of order k falls by 2^k, so that log2 of the ratio is k.
     steps: FloatArray = largest * 0.5 ** np.arange(8.0)
     zeroth = np.array([evaluator(at + h * direction).cost for h in steps]) - base.cost
     first = zeroth - steps * (base.gradient @ direction)
     second = first - 0.5 * steps**2 * (direction @ base.hessian @ direction)
     remainders = np.abs(np.stack([zeroth, first, second], axis=1))
+    # J has a relative rounding error of many operations, not of one; below a thousand of them the ratio is random.
     rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
     with np.errstate(divide="ignore", invalid="ignore"):
         orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
@@ -190,8 +196,12 @@ def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[flo
     """
     if not is_covered_by_paper(evaluator.problem):
         return np.nan, np.nan
+    # Two derivations that share nothing but the modes: optimise, then discretise, against the exact derivatives of what
+    # is discretised.
     paper, discrete = evaluator(theta, method="adjoint"), evaluator(theta)
     scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(discrete.hessian)), 1e-300))
+    # In scaled unknowns the curvature is about 1: a change of all by 0.1 % changes the gradient by 1e-3 |theta /
+    # scale|.
     small = 1e-3 * float(np.linalg.norm(theta / scale))
     scales = np.outer(scale, scale)
     return (
@@ -203,8 +213,10 @@ def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[flo
 def measure_closing_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:
     """Return the gaps of `measure_derivative_gap`; where one is too large, the smaller ones with half the steps."""
     gaps = measure_derivative_gap(evaluator, theta)
+    # NaN, the gap of what the paper does not cover, is not above anything.
     if not max(gaps) > LARGEST_GAP or evaluator.takes_implicit_steps:
         return gaps
+    # An integration error falls with the steps; a wrong derivative has the same gap on both meshes.
     return min(gaps, measure_derivative_gap(halve_cells(evaluator), theta), key=max)
 
 
@@ -235,9 +247,12 @@ def _move_off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 
 def _find_room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -> float:
     """Return the largest step with every transition time in its cell, and each unknown changed little for its size."""
+    # 1 % of each unknown: beyond that a model that is exponential in one of them is no cubic any more.
     room = 1e-2 * np.min(np.where(theta != 0, np.abs(theta), 1.0) / np.abs(direction))
     here, there = (_list_breaks(evaluator, at) for at in (theta, theta + direction))
     for i, breaks in enumerate(here):
+        # Breaks move too: the time that a late sample sees moves with the delay. What counts is how fast the unknown
+        # and its break come nearer to each other along the direction.
         closing = np.maximum(np.abs(there[i] - breaks - direction[i]), 1e-300)
         room = min(room, np.min(0.9 * np.abs(breaks - theta[i]) / closing, initial=np.inf))
     return float(room)

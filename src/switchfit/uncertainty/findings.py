@@ -56,6 +56,7 @@ def has_looked(fit: Fit) -> bool:
     ----------
     fit : Fit
     """
+    # (tried, lower, agreeing): a start that ended lower means that the fit is not where it should be.
     if fit.starts is not None and fit.starts[0] > 0:
         return fit.starts[1] == 0
     return len(fit.steps) > 1 and fit.steps[-1].ended == "" and fit.steps[-1].cost == fit.steps[-2].cost
@@ -73,6 +74,8 @@ def explain_doubt(fit: Fit, quality: Quality | None, doubt: Doubt) -> Iterator[F
         held = tuple(name for issue in find_active_bounds(fit) for name in issue.subjects)
         yield Finding(level, Issue(kind, held), ("move the bound",))
     elif kind == "not determined":
+        # The smallest eigenvalue of the Hessian scaled to unit curvature, and who trades off in its eigenvector. A flat
+        # direction has names of its own.
         smallest, names = find_weakest(fit)
         weakest = names or tuple(name for name, _ in fit.flat_direction)
         yield Finding(level, Issue(kind, weakest, {"eigenvalue": smallest}), (FIX,))
@@ -103,11 +106,14 @@ def _find_ending(fit: Fit) -> Iterator[Finding]:
     if fit.reason is not None and fit.reason.kind in WRITTEN_OTHERWISE:
         yield Finding("bad", fit.reason, (WRITTEN_OTHERWISE[fit.reason.kind],))
         steps = ()
+    # The reason why the last step failed, such as a model that cannot be integrated there, says more than the status.
     elif fit.status is Status.LINE_SEARCH_FAILED and fit.reason is not None:
         subjects = (*subjects, fit.reason.kind, *fit.reason.subjects)
         figures |= fit.reason.figures
         steps = ADVICE_BY_FAILURE.get(fit.reason.kind, ("more starts",))
     smallest, names = find_weakest(fit)
+    # Two findings of two levels: that it has not converged is bad; why, a direction that the data hardly determine, is
+    # no mistake of the fit.
     if fit.status is Status.MAX_ITERATIONS and abs(smallest) < BARELY_DETERMINED:  # it creeps along a valley
         yield Finding("bad", Issue("not converged", subjects, figures))
         yield Finding("doubtful", Issue("not determined", names, {"eigenvalue": smallest}), (FIX, *steps[:1]))
@@ -131,6 +137,7 @@ def find_cut_search(fit: Fit, quality: Quality | None) -> Iterator[Finding]:
     is_noise = quality is not None and quality.channels and quality.known and quality.probability >= UNLIKELY_AS_NOISE
     tried, lower, agreeing = fit.starts or (0, 0, 0)
     is_agreed = lower == 0 and agreeing >= max(2, AGREEING * tried)
+    # A fit that has not converged has its own finding; and only the last step can have been cut.
     is_cut = bool(fit.status.successful and fit.steps and fit.steps[-1].ended == "time")
     if is_cut and not is_noise and not is_agreed:
         yield Finding("doubtful", Issue("search cut short", (fit.steps[-1].strategy,)), ("more time",))
@@ -147,6 +154,8 @@ def find_other_doubts(fit: Fit, certificate: Certificate) -> Iterator[Finding]:
         yield Finding("doubtful", Issue("rivals", names, {"at": places, "rise": rises}), (PROFILES,))
     for issue in find_without_effect(fit):
         yield Finding("doubtful", issue, (ADVICE_WITHOUT_EFFECT[issue.kind],))
+    # On a logarithmic scale 0 is infinitely far away: an unknown that the data cannot tell from it creeps there, and
+    # its error grows with the distance.
     vanishing = (
         np.isin(fit.theta_names, fit.log_scaled) & ~fit.is_time & (fit.standard_errors > VANISHING_ERRORS * fit.theta)
     )
@@ -154,6 +163,7 @@ def find_other_doubts(fit: Fit, certificate: Certificate) -> Iterator[Finding]:
         names = tuple(np.array(fit.theta_names, dtype=object)[vanishing].tolist())
         yield Finding("doubtful", Issue("vanishing", names), ("linear scale",))
     for failure in certificate.failures:
+        # That one is a doubt from numbers alone already (`doubts`).
         if failure.kind != "integration error":
             yield Finding("doubtful", failure, ("check derivatives",))
 

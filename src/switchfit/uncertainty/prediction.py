@@ -252,6 +252,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
         points = estimate.sensitivities[experiment].nodes
     else:
         asked = _check_times(times, problem, experiment)
+        # Times beyond the mesh need another one; those inside are put in as nodes, so that nothing is interpolated.
         if asked.max() > fit.trajectories[experiment].times[-1]:
             points = _simulate_beyond(problem, experiment, fit.theta, asked)
         else:
@@ -305,6 +306,7 @@ def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, times: FloatAr
             f"times must not lie after tf where tf is estimated: the system stops there; got {last:.6g}"
             f"{unit_suffix(experiment.time_unit)}."
         )
+    # Data stay where they are: the last mode goes on with no transition to follow.
     longer = replace(experiment, tf=last)
     runs = [longer if k == e else run for k, run in enumerate(problem.experiments)]
     extended = replace(problem, experiments=runs)
@@ -313,6 +315,7 @@ def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, times: FloatAr
 
 def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return ``sqrt(X C X')`` of derivatives (K, q, d): (K, q)."""
+    # X C X' may be -1e-20 by rounding where nothing is uncertain, as of a known initial state at t0.
     variance = np.einsum("kqd,de,kqe->kq", derivative, covariance, derivative)
     return np.sqrt(np.maximum(variance, 0.0))
 
@@ -324,6 +327,7 @@ def _get_noise(fit: Any, problem: Problem, e: int, times: FloatArray) -> FloatAr
     unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
     for item, comparison in zip(problem.experiments[e].measurements, fit.comparisons[e], strict=True):
         sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
+        # Nearest sample in time, by the times at which the sensor says what it has seen: hence the delay is added.
         halfway = 0.5 * item.times[1:] + 0.5 * item.times[:-1]
         columns.append(sigma[np.searchsorted(halfway, times + find_delay(comparison, fit.trajectories[e]))])
     return np.concatenate(columns, axis=1)

@@ -94,6 +94,7 @@ class Quality:
     @property
     def worst(self) -> tuple[ChannelQuality, ...]:
         """Channels whose residuals are no noise, the least likely first; if there is none, that explained worst."""
+        # A channel without a test has probability NaN: it counts as 1, and is ranked by what it explains.
         ranked = sorted(self.channels, key=lambda c: np.nan_to_num([c.probability, c.explained], nan=1.0).tolist())
         return tuple(c for c in ranked if c.probability * len(ranked) < UNLIKELY_AS_NOISE) or tuple(ranked[:1])
 
@@ -102,6 +103,8 @@ class Quality:
         """What is to blame for residuals that are no noise: the "model", "outliers", or "sigma"."""
         tests = self.worst[0].tests
         failed = [name for name, probability in tests.items() if probability * len(self.channels) < UNLIKELY_AS_NOISE]
+        # In the order of `tests`: a wrong model also makes large residuals and a wrong size, so that it comes first.
+        # Too few residuals for a test of whiteness leave the model suspected.
         return failed[0] if failed and "model" in tests else "sigma" if "model" in tests else "model"
 
 
@@ -117,12 +120,14 @@ def measure_quality(fit: Fit) -> Quality:
     channels: list[ChannelQuality] = []
     for label, e, comparison, k in list_channels(fit.comparisons, fit.run_names):
         residuals = next(diagnosed) if comparison.kind == "measurements" else None
+        # A channel without values, or whose fit is not finite, cannot be judged.
         squares, spread, _ = sum_squares(comparison, k)
         if not np.isfinite(squares):
             continue
         explained, chi_square, tests = 1 - squares / spread if spread > 0 else np.nan, np.nan, {}
         if residuals is not None and residuals.sigma_known and comparison.downweighted is None:
             chi_square = float(residuals.values @ residuals.values)
+        # Data that are met to rounding leave no residuals to test: what is left is arithmetic.
         if residuals is not None and not 1 - explained < NO_RESIDUALS:
             tests = _test_residuals(comparison, k, residuals, is_given)
         channels.append(
@@ -139,6 +144,7 @@ def measure_quality(fit: Fit) -> Quality:
             )
         )
     chi_square, known = np.nan, False
+    # Bonferroni: of so many channels the least likely one is that unlikely by chance.
     found = [len(channels) * channel.probability for channel in channels if channel.tests]
     if is_given and np.isfinite(fit.residual_variance):
         chi_square = 2 * fit.cost
@@ -160,11 +166,14 @@ def _test_residuals(comparison: Comparison, k: int, residuals: ChannelResiduals,
     if comparison.downweighted is not None:
         if is_given:
             above = int(np.sum(z > SERIOUS_WIDENING * special.ndtri(0.75)))
+            # Half of normal residuals are beyond 0.6745 sigma. The factor leaves room for outliers, which are no
+            # concern beside a robust loss.
             tests["sigma"] = float(special.bdtrc(above - 1, n, HALF))
         elif not are_outliers(comparison.downweighted[np.isfinite(comparison.residuals[:, k]), k], z):
             tests["sigma"] = 0.0
         return tests
     if n >= FEWEST_RESIDUALS and residuals.rms > 0:
+        # The largest of n: at most n times the probability of one, on both sides.
         tests["outliers"] = float(2 * n * special.ndtr(-z.max() / residuals.rms))
     if is_given:
         tests["sigma"] = float(compare_with_sigma(residuals.rms**2 * n, n)[0])

@@ -69,9 +69,12 @@ class Sensitivity:
 
     def at(self, times: FloatArray) -> Points:
         """Return the sensitivity at nodes (K,) of the mesh; at a transition, that just before it, as for a sample."""
+        # Two rows meet at a node; that which ends there has the state before a transition, which a sample at that time
+        # sees.
         row = self.simulation.row_ending(np.searchsorted(self.simulation.nodes, times) - 1)
 
         def pick(before: FloatArray, after: FloatArray) -> FloatArray:
+            # No row ends at t0: its state is that before the first row.
             first = (row < 0).reshape(-1, *[1] * (after.ndim - 1))
             return np.where(first, before[:1], after[row])
 
@@ -107,6 +110,7 @@ def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh)
         It must have all sample times and knots as nodes.
     """
     run = runs_of(problem)[e]
+    # On a mesh of its own, which has the times that are asked for as nodes: an evaluator's mesh is not touched.
     engine = engine_of(run, run.build_arguments(mesh), mesh)
     simulation = engine.simulate(*run.vectors(theta), tangents=True)
     return Sensitivity(simulation, problem.places[e], theta)

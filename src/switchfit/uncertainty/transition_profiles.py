@@ -51,8 +51,11 @@ def trace_profiles(
     evaluator : Evaluator
     level : float
     """
+    # Arrays without entries, of the right shapes and types: what is saved can be loaded again.
     nothing = fit.saved_pieces[:0], fit.saved_piece_places[:0]
     highest = compute_threshold(fit, max(level, HIGHEST_LEVEL))
+    # A density is needed far out: its quantiles ask for all of its mass, where an interval by a threshold needs one
+    # crossing.
     rise = max(highest, HIGHEST_RISE * fit.variance_scale)
     if np.isnan(highest) or fit.constraints or len(problem.experiments) > MOST_TRACED_RUNS:
         return nothing
@@ -60,11 +63,13 @@ def trace_profiles(
         return nothing
     # Unknowns that are free one by one, and have an effect on J.
     movable = (np.sum(fit.free_basis**2, axis=1) > 1 - 1e-9) & fit.hessian.any(axis=1)
+    # Fits as rows of arrays, here one: `walks` are the same code as for many fits.
     kinks, resets, at, places = {kink.unknown for kink in fit.kinks}, list_resets(fit), fit.theta[None], []
     ways: list[Walks] = []
     for e, k in list_transitions(problem):
         samples = stack_sample_times(problem, at, e)
         near = is_any_near(samples, at[:, k], fit.standard_errors[k : k + 1])[0]
+        # A time that a kink holds always has two different sides. Others need their pieces where a sample is near.
         if fit.theta_names[k] in kinks or (movable[k] and (near or k in resets)):
             threshold = np.array([rise if k in resets else highest])
             ways.append(list_walks(problem, e, k, at, movable[None], threshold, samples, MOST_PIECES))
@@ -77,10 +82,12 @@ def trace_profiles(
         found = [follower(theta, side) for theta, side in zip(thetas, walks.side[which].tolist(), strict=True)]
         return Derivatives(*(np.array([getattr(one, name) for one in found]) for name in Derivatives._fields))
 
+    # Stretches are one more than the samples between them, and the last of them is cut up to MOST_HALVINGS times.
     most = MOST_PIECES + MOST_HALVINGS + 1
     costs = np.full(len(walks.place), fit.cost)
     pieces = trace_walks(walks, costs, evaluate, most, problem.unknowns.times).reshape(-1, 2, most, NUMBERS_OF_PIECE)
     known = ~np.isnan(pieces[..., 0])
+    # A side whose first piece could not be traced has no profile; the interval of one parabola stays then.
     complete = known[:, :, 0].all(axis=1)
     return pieces[complete, :, : int(known.sum(axis=2).max())], np.array(places)[complete]
 
