@@ -30,18 +30,19 @@ from switchfit.engine.hypotheses import Hypotheses
 from switchfit.estimation.estimates import Estimate
 from switchfit.estimation.estimating import estimate
 from switchfit.online.calibration import calibrate
-from switchfit.online.feed import Feed, shift_cubic
+from switchfit.online.feed import Feed
 from switchfit.online.files import append_update, read_journal, read_state
+from switchfit.online.held_inputs import HeldInputs
 from switchfit.online.information import invert
 from switchfit.online.kept_problem import build_kept_problem
-from switchfit.online.samples import hold_inputs, read_sigma
+from switchfit.online.samples import hold_inputs
+from switchfit.online.sensors import Sensors
 from switchfit.online.state import Alarm, Best, Now, OnlineStatus
 from switchfit.online.tracker import StoppedError, Tracker, TrackerSettings
 from switchfit.online.window_start import Start
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
-from switchfit.problem.signals import PiecewisePolynomial
-from switchfit.problem.validation.arrays import as_array, as_count, as_finite, as_index, as_number, as_positive
+from switchfit.problem.validation.arrays import as_count, as_finite, as_number, as_positive
 from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.problem.validation.names import as_names, require_known
 from switchfit.problem.validation.objects import as_instance, as_path
@@ -166,7 +167,7 @@ class OnlineEstimator:
         self.capacity, births = as_count(capacity, "capacity", at_least=1), as_count(max_switches, "max_switches")
         renewed = _read_table(renews, "renews", "a mode and the parameters that are new when it begins: {'slip': 'mu'}")
         walks = _read_table(drift, "drift", "a parameter and the standard deviation of its random walk: {'mu': 0.01}")
-        self._sensors = _check_problem(problem)
+        self._sensors = Sensors(problem)
         run = problem.experiments[0]
         given: dict[str, Any] = {"successions": successions, "min_duration": min_duration, "max_switches": births}
         library = build_library(problem, first=run.mode_sequence[0], **given)
@@ -185,13 +186,6 @@ class OnlineEstimator:
         self._settings = TrackerSettings(
             rules, slots, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold
         )
-        self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
-        pairs = [(k, own) for k, item in enumerate(self._sensors) for own in enumerate(item.names or ())]
-        self._channels: dict[str, tuple[int, int]] = {}
-        for k, (column, name) in pairs:
-            self._channels.setdefault(name, (k, column))
-        gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
-        self._usual = min(gaps, default=None)
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]
         require_known(renewed, "renews", problem.system.modes)
         self._renews = {mode: self._find_places(names, f"renews of {mode!r}") for mode, names in renewed.items()}
@@ -201,8 +195,8 @@ class OnlineEstimator:
             step = as_positive(walks[name], f"drift of {name}")
             self._walks[self._slices[name]] = as_positive(step * step, f"the square of the drift of {name}")
         # One wild sample shall not make a model that is right look lost: its share of chi-square is cut off here.
-        self._outlier = float(special.chdtri(sum(map(len, self._weights)), OUTLIER))
-        self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
+        self._outlier = float(special.chdtri(sum(map(len, self._sensors.weights)), OUTLIER))
+        self._inputs = HeldInputs(run)
         self._journal: Path | None = None
         self.reset()
         if false_alarms is not None:
@@ -223,6 +217,11 @@ class OnlineEstimator:
     def _build_like(self, problem: Problem, threshold: float) -> OnlineEstimator:
         """Return an estimator of another problem with the same settings, without a budget: for `calibrate`."""
         return OnlineEstimator(problem, **self._given_settings, threshold=threshold)
+
+    @property
+    def held(self) -> FloatArray | None:
+        """The inputs that hold since the last update that had some, (q,); None before."""
+        return self._inputs.held
 
     def set_threshold(self, threshold: float) -> None:
         """Set the threshold of the statistic, and forget all samples.
@@ -258,9 +257,9 @@ class OnlineEstimator:
         True
         """
         self._feed = Feed(self._beam.engine, self.problem.experiments[0].t0, self.capacity)
-        self.spacing = self._usual
+        self.spacing = self._sensors.spacing
         self._tracker = self._start_tracking()
-        self.held: FloatArray | None = None
+        self._inputs.held = None
         self._renewed = float(self._feed.nodes[0])
         self._alarms: list[Alarm] = []
         self._values, self._fitted = 0, (0.0, 0)  # values so far; lowest cost and values at the last update
@@ -313,7 +312,7 @@ class OnlineEstimator:
         t = as_finite(as_number(t, "t"), "t")
         if self._stopped is not None:
             raise StoppedError(self._stopped)
-        samples = self._read(y)
+        samples = self._sensors.read(y)
         if self._journal is not None:
             # Before anything is computed: a process that is killed in between finds the sample again.
             append_update(self._journal, t, samples, u)
@@ -353,38 +352,11 @@ class OnlineEstimator:
         usual = self._costs[what]
         self._costs[what] = 0.8 * usual + 0.2 * (clock.perf_counter() - began) if done else 0.95 * usual
 
-    def _read(self, y: object) -> dict[int, FloatArray]:
-        """Return the values (q,) of the sensors of an update by their places, NaN where one is missing."""
-        if y is not None and not isinstance(y, Mapping):
-            if len(self._sensors) > 1:
-                raise ValueError(
-                    f"there are {len(self._sensors)} sensors: give y as a dict, by the names of channels, or by the "
-                    "positions of the sensors in the data."
-                )
-            y = {0: y}
-        found: dict[int, FloatArray] = {}
-        for key, value in ({} if y is None else y).items():
-            if isinstance(key, str):
-                if key not in self._channels:
-                    known = ", ".join(self._channels) or "none has a name"
-                    raise ValueError(f"y has {shorten(key)}, which is no channel; there are: {known}.")
-                k, column = self._channels[key]
-                found.setdefault(k, np.full(len(self._weights[k]), np.nan))[column] = as_number(value, key)
-                continue
-            k = as_index(key, "the position of a sensor", len(self._sensors))
-            found[k] = as_array(value, f"y of sensor {k}").reshape(-1)
-            if found[k].size != len(self._weights[k]):
-                raise ValueError(f"y must have {len(self._weights[k])} values of a sensor; got {found[k].size}.")
-        for row in found.values():
-            if np.isinf(row).any():
-                raise ValueError(f"y must be finite, or NaN where a value is missing; got {shorten(row.tolist())}.")
-        return {k: row for k, row in found.items() if np.isfinite(row).any()}
-
     def _place(self, t: float, samples: dict[int, FloatArray], u: ArrayLike | Mapping[str, float] | None) -> int:
         """Put the samples of an update into the log, and return the first node that is to be computed."""
         feed, tracker = self._feed, self._tracker
         # A sample that comes with a delay belongs to the state at t - delay: that is its node.
-        seen = [(t - float(self._sensors[k].delay), k) for k in samples]
+        seen = [(t - float(self._sensors.items[k].delay), k) for k in samples]
         begin = float(feed.nodes[tracker.first])
         for time, k in [(t, None), *seen]:
             node = feed.find(time)
@@ -397,7 +369,7 @@ class OnlineEstimator:
                 raise ValueError(f"there are two samples of one sensor at t = {time:.9g}.")
         # Nothing is new so far: `changed` falls to the earliest node that this update touches.
         changed = feed.count if self.now is not None else 0
-        held = self._hold(u)
+        held = self._inputs.hold(u)
         if t > feed.last:
             gap = t - feed.last
             # The spacing of the log is known with its second sample: the tracker, whose births are scaled by it, begins
@@ -408,9 +380,9 @@ class OnlineEstimator:
             # A long gap gets nodes of its own: a row must not be much longer than what the hypotheses were linearised
             # for.
             count = ceil(min(gap / (LONGEST_GAP * (self.spacing or gap)), MOST_BETWEEN))
-            for time in self._list_times(feed.last, t, count, held):
+            for time in self._inputs.list_times(feed.last, t, count, held):
                 node = feed.insert(time)
-                self._write_signal(node - 1, held)
+                self._inputs.write(feed, node - 1, held)
         elif feed.nodes[feed.find(t)] != t:
             changed = min(changed, feed.insert(t))
         for time, k in seen:
@@ -418,52 +390,10 @@ class OnlineEstimator:
             if feed.nodes[node] != time:
                 node = feed.insert(time)
             there = np.isfinite(samples[k])
-            feed.add(k, node, np.where(there, samples[k], 0.0), np.where(there, self._weights[k], 0.0))
+            feed.add(k, node, np.where(there, samples[k], 0.0), np.where(there, self._sensors.weights[k], 0.0))
             self._values += int(there.sum())
             changed = min(changed, node)
         return changed
-
-    def _list_times(self, begin: float, end: float, count: int, held: FloatArray | None) -> list[float]:
-        """Return `end`, and times before it: evenly spaced ones, and the knots of inputs that are not held."""
-        step = (end - begin) / count
-        found = [*(begin + k * step for k in range(1, count)), end]
-        if held is None and self._signal is not None:
-            knots = self._signal.knots
-            inside = knots[knots.searchsorted(begin, "right") : knots.searchsorted(end, "left")]
-            found = np.unique(np.concatenate([found, inside])).tolist()
-        return found
-
-    def _hold(self, u: ArrayLike | Mapping[str, float] | None) -> FloatArray | None:
-        """Return the inputs up to this update, after which those that come with it hold."""
-        before, run = self.held, self.problem.experiments[0]
-        if u is None:
-            return before
-        if self._signal is None or run.inputs is None:
-            raise ValueError("u was given, but the experiment has no inputs.")
-        if isinstance(u, Mapping):
-            if set(u) != set(run.inputs.names):
-                raise ValueError(f"u must have the inputs {', '.join(run.inputs.names)}; got {', '.join(map(str, u))}.")
-            u = [u[name] for name in run.inputs.names]
-        given = as_array(u, "u").reshape(-1).copy()
-        if given.shape != (self._signal.channels,) or not np.isfinite(given).all():
-            raise ValueError(f"u must be {self._signal.channels} finite values; got {shorten(given.tolist())}.")
-        # These hold from now on; up to now the ones before hold, which are returned.
-        self.held = given
-        return given if before is None else before
-
-    def _write_signal(self, cell: int, held: FloatArray | None) -> None:
-        """Write the inputs in a cell: those that are held, or the problem's."""
-        whole: PiecewisePolynomial | None = self._signal
-        if whole is None:
-            return
-        into, (begin, end) = self._feed.signals[cell], self._feed.nodes[cell : cell + 2].tolist()
-        if held is not None:
-            into[0], into[1:] = held, 0.0
-            return
-        if end > whole.knots[-1] and whole.coefficients[-1, 1:].any():
-            raise ValueError(f"the inputs of the problem end at {whole.knots[-1]:.9g}: give u from then on.")
-        k = int(whole.interval(np.array([0.5 * (begin + end)]))[0])
-        into[:] = shift_cubic(whole.coefficients[k], begin - whole.knots[k])
 
     def _slide(self) -> None:
         """Let nodes leave the window."""
@@ -588,7 +518,7 @@ class OnlineEstimator:
     def _shape(self) -> list[Any]:
         """What has to be the same where the hypotheses are taken up again."""
         problem, settings, engine = self.problem, self._settings, self._tracker.beam.engine
-        channels = [list(item.names or ()) for item in self._sensors]
+        channels = [list(item.names or ()) for item in self._sensors.items]
         names = [list(problem.system.modes), list(problem.parameters), channels]
         return [*names, settings.width, settings.births, engine.record_size]
 
@@ -630,7 +560,7 @@ class OnlineEstimator:
         numbers, arrays = read_state(file)
         online = cls(problem, **settings, threshold=numbers["threshold"])
         online.spacing, online._values, online._renewed = (numbers[n] for n in ("spacing", "_values", "_renewed"))
-        online.held = None if numbers["held"] is None else np.array(numbers["held"])
+        online._inputs.held = None if numbers["held"] is None else np.array(numbers["held"])
         online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
         online._tracker = online._start_tracking()
         # The engine of the beam has its limits and tolerances only after a first step; its records are then those of
@@ -648,12 +578,12 @@ class OnlineEstimator:
         """Return what has been measured since the start of the window, and what else the run has since then."""
         tracker, feed, first = self._tracker, self._feed, self._tracker.first
         data = []
-        for k, item in enumerate(self._sensors):
+        for k, item in enumerate(self._sensors.items):
             times, values, weights = feed.samples(k)
             there = times > feed.nodes[first] if tracker.start is not None else np.ones(len(times), dtype=bool)
             shown = np.where(weights > 0, values, np.nan)[there]
             if np.isfinite(shown).any():
-                sigma = self._weights[k] ** -0.5
+                sigma = self._sensors.weights[k] ** -0.5
                 data.append(replace(item, times=times[there] + item.delay, values=shown, sigma=sigma))
         inputs = self.problem.experiments[0].inputs
         if inputs is not None and self.held is not None:
@@ -837,24 +767,3 @@ def _read_table(given: Any, what: str, form: str) -> Mapping[Any, Any]:
     if given is not None and not isinstance(given, Mapping):
         raise TypeError(f"{what} must be a dict of {form}; got {shorten(given)}.")
     return given or {}
-
-
-def _check_problem(problem: Problem) -> list[Measurements]:
-    """Return the sensors of a problem that can be estimated online; ValueError for others."""
-    run = problem.experiments[0]
-    sensors = list(run.measurements)
-    wrong = {
-        f"{len(problem.experiments)} runs": len(problem.experiments) > 1,
-        "other data": len(sensors) < len(run.data),
-        "jumps at known times": bool(run.jumps),
-        "a sigma that is left out": any(item.sigma is None for item in sensors),
-        "a sigma that is a parameter": any(item.sigma_names for item in sensors),
-        "a delay that is a parameter": any(isinstance(item.delay, str) for item in sensors),
-    }
-    found = [what for what, is_there in wrong.items() if is_there]
-    if found:
-        raise ValueError(
-            "an online estimator takes one run of sf.Measurements whose sigma and delay are numbers, which tell a "
-            f"change of mode from noise; the problem has {join_names(found)}."
-        )
-    return sensors
