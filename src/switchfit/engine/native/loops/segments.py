@@ -4,7 +4,7 @@ Rows are numbered by ``cell + segment``: each transition cuts one cell in two. R
 
     cells      |     0     |     1     |     2     |       nodes t_0 .. t_3, one transition tau in cell 1
     rows       |     0     |  1  |  2  |     3     |       segment 0: rows 0 and 1, segment 1: rows 2 and 3
-    states     0           1    2           3     4       `x`, `Z`; x(tau+) is in `reset_x` if there is a reset map
+    states     0           1    2           3     4       `x`, Z; x(tau+) is in "reset_x" if there is a reset map
 
 The mode of a segment, and the reset map and other functions of a transition, are read at run time, so that all
 sequences of a library share a program. Segments that a sequence does not need are idle: they begin and end at tf.
