@@ -48,7 +48,7 @@ def resume(fit: Fit) -> Callable[[Case, np.ndarray], End]:
             calls, iterations, seconds = calls + end.evaluations, iterations + end.iterations, seconds + end.optimizing
             theta = np.array(end.theta)
             held = evaluator.constrained(theta).constraints if problem.constraint_names else []
-            _, _, error, _ = judge_meshes(evaluator, theta, end.said, first_cost, held, by_cells=False)
+            _, _, error, _ = judge_meshes(evaluator, theta, end.said, first_cost, held)
             excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
             if attempt == REFINEMENTS or not excess > 1:
                 break

@@ -81,8 +81,10 @@ def test_a_fit_that_has_not_converged_on_coarse_meshes_is_replaced(monkeypatch, 
     """It may have gone down into their error: its J would be lower than that of any honest end."""
     stopped = replace(right, status=Status.MAX_ITERATIONS, integration_error=1e-3, cost=0.9 * right.cost)
     first = iter([stopped])
-    real = choice.fit_locally
-    monkeypatch.setattr(choice, "fit_locally", lambda *given, **settings: next(first, None) or real(*given, **settings))
+    real = choice.fit_on_meshes
+    monkeypatch.setattr(
+        choice, "fit_on_meshes", lambda *given, **settings: next(first, None) or real(*given, **settings)
+    )
     found = sf.estimate(thermostat(FAR))
     assert [(step.strategy, np.isfinite(step.cost)) for step in found.steps] == [
         ("local", False),

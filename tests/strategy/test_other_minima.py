@@ -9,6 +9,7 @@ import pytest
 import switchfit as sf
 from support.models import first_state, fit_problem, one_run, simulate_log
 from support.two_minima import TWO_MINIMA
+from switchfit.meshes.evaluator import evaluator_of
 from switchfit.strategy import other_minima
 
 THOROUGH = ("estimated sigmas",)
@@ -65,7 +66,7 @@ def test_a_minimum_is_found_although_the_exact_hessian_far_away_has_none(monkeyp
     assert not sf.estimate(problem, time_budget=1e-9).steps, "no time is left to look elsewhere"
     (run,) = problem.experiments
     unknown = replace(problem, experiments=replace(run, data=replace(run.data[0], sigma=None)))
-    starts, _ = other_minima.find_other_minima(sf.estimate(unknown, strategy="local"))
+    starts, _ = other_minima.find_other_minima(sf.estimate(unknown, strategy="local"), evaluator_of(unknown))
     assert starts[0][0] == pytest.approx(5.0, abs=0.1)
     monkeypatch.setattr(other_minima, "find_far_minima", lambda *given: 1 / 0)
     assert sf.estimate(problem).theta[0] == near.theta[0], "the fit is not lost"

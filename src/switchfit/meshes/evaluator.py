@@ -61,6 +61,8 @@ class Evaluator:
     arguments : list of Arguments
     engines : list of Engine
         One for each experiment.
+    is_kept : bool
+        Whether it is the problem's own (`evaluator_of`): what is made for it serves all fits from the initial guess.
     halved : Evaluator or None
         The same problem on halved cells, once `halve_cells` has been asked for it.
     """
@@ -82,6 +84,7 @@ class Evaluator:
             arguments = [run.build_arguments(mesh) for run, mesh in zip(self.runs, padded, strict=True)]
         self.arguments = list(arguments)
         self.engines = list(map(engine_of, self.runs, self.arguments, self.meshes))
+        self.is_kept = False
         self.halved: Evaluator | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -257,4 +260,6 @@ def is_covered_by_paper(problem: Problem) -> bool:
 @keep_with_problem
 def evaluator_of(problem: Problem) -> Evaluator:
     """Return the problem's own evaluator, built once and cached; its meshes are refined at the initial guess."""
-    return Evaluator(problem)
+    evaluator = Evaluator(problem)
+    evaluator.is_kept = True
+    return evaluator

@@ -9,6 +9,7 @@ from __future__ import annotations
 from switchfit.arrays import FloatArray
 from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.refinement import refine_if_unstable
+from switchfit.runtime.errors import NotIntegrableError
 
 ORDER_OF_METHODS = 5
 """Order of both integrators, and of the decrease of their error as steps are divided."""
@@ -43,6 +44,42 @@ def stabilize(evaluator: Evaluator, *thetas: FloatArray) -> Evaluator | None:
     if not any(found):
         return None
     return Evaluator(evaluator.problem, meshes=[new or mesh for new, (_, mesh) in zip(found, each, strict=True)])
+
+
+def choose_next_meshes(
+    evaluator: Evaluator,
+    start: FloatArray,
+    theta: FloatArray,
+    excess: float,
+    *,
+    failed: bool,
+    stopped: bool,
+    first: bool,
+) -> Evaluator | None:
+    """Return the problem on the meshes on which a fit goes on from theta; None if it is over.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+        On the meshes of the fit so far.
+    start, theta : (d,)
+        Where the fit began, and where it is now.
+    excess : float
+        Integration error in units of the largest one that is allowed.
+    failed : bool
+        Whether the fit has not converged: its steps may be unstable.
+    stopped : bool
+        Whether it was stopped, and goes on only with stable steps in place of unstable ones.
+    first : bool
+        Whether it has worked on its first meshes so far.
+    """
+    stable = stabilize(evaluator, start, theta) if failed or excess > 2**ORDER_OF_METHODS else None
+    if stable is not None or stopped or not excess > 1:
+        return stable
+    try:
+        return refine_meshes(evaluator, start, theta, excess, first=first)
+    except NotIntegrableError:  # what was found stays, with its integration error
+        return None
 
 
 def refine_meshes(

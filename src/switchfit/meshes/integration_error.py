@@ -53,8 +53,6 @@ def judge_meshes(
     cost: float,
     first_cost: float,
     constraints: Sequence[float],
-    *,
-    by_cells: bool,
 ) -> tuple[Evaluator, float, float, str]:
     """Return the problem with all steps at theta halved, J there, the largest integration error and its output.
 
@@ -69,12 +67,10 @@ def judge_meshes(
         J, guards and terminal constraints of the evaluator at theta.
     first_cost : float
         J at the start of the fit.
-    by_cells : bool
-        Whether to halve cells first.
     """
     problem = evaluator.problem
     outputs = ("J", *problem.constraint_names)
-    for halve in (halve_cells, partial(halve_rows, theta=theta))[not by_cells :]:
+    for halve in (halve_cells, partial(halve_rows, theta=theta))[not evaluator.is_kept :]:
         fine = halve(evaluator)
         fine_cost = fine.cost(theta)
         # The errors of constraints are computed from the states alone, so that nothing is compiled for these meshes.

@@ -647,6 +647,20 @@ def require_estimable(problem: Problem) -> None:
     require_samples(problem)
 
 
+def check_start(problem: Problem, start: ArrayLike | None) -> FloatArray:
+    """Return where a fit begins, (d,): a start in the order of theta, or the initial guess for None.
+
+    Raises
+    ------
+    ValueError
+        As `Problem.check_theta` does, and where an unknown on a logarithmic scale is not above 0.
+    """
+    first, unknowns = problem.check_theta(start, "start"), problem.unknowns
+    if names := [unknowns.names[i] for i in np.flatnonzero(unknowns.log & ~unknowns.is_time & (first <= 0))]:
+        raise ValueError(f"start must be above 0 for {join_names(names)}, whose scale is 'log'; got {shorten(first)}.")
+    return first
+
+
 def require_samples(problem: Problem) -> None:
     """Raise ValueError if a sensor has no samples, as it may for an `OnlineEstimator`."""
     for name, run in zip(problem.run_names, problem.experiments, strict=True):

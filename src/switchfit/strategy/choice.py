@@ -6,18 +6,18 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
-from switchfit.fit.local_fit import fit_locally
+from switchfit.fit.local_fit import HESSIANS, check_settings, fit_on_meshes
 from switchfit.fit.search_record import Rival
-from switchfit.meshes.evaluator import evaluator_of
+from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.minimization_problem import HessianKind
-from switchfit.problem.problem import Problem, require_estimable
+from switchfit.problem.problem import Problem, check_start, require_estimable
 from switchfit.problem.validation.arrays import as_positive
 from switchfit.problem.validation.names import as_choice
 from switchfit.problem.validation.objects import as_callable, as_instance
@@ -63,28 +63,33 @@ def find_best_fit(
     """
     as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
     require_estimable(problem)
+    begin = check_start(problem, start)
     strategy = as_choice(strategy, "strategy", STRATEGIES)
     budget = None if time_budget is None else as_positive(time_budget, "time_budget")
     if callback is not None:
         as_callable(callback, "callback", "a function callback(record)", arguments=1)
-    settings: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "hessian": hessian}
+    hessian = as_choice(hessian, "hessian", HESSIANS)
+    tolerance, max_iterations = check_settings(tolerance, max_iterations)
 
     began = time.perf_counter()
     with show_line("fit: not begun, or compiling (only the first time)") as line:
-
-        def fit(start: ArrayLike | None, name: str, first_cost: float = 0.0) -> JudgedFit:
-            """Return a fit from a start; `name` is what it is called on the line of progress."""
-            report = _write_to(line, name, callback)
-            found = fit_locally(problem, start=start, callback=report, first_cost=first_cost, **settings)
-            return JudgedFit.take_over(found)
-
         # Its meshes are made before work is counted: those of a problem that was fitted before are there already.
+        own: Evaluator | None = None
         with suppress(NotIntegrableError):  # the fit says why
-            evaluator_of(problem)
+            own = evaluator_of(problem)
+
+        def fit(evaluator: Evaluator, theta: FloatArray, name: str, first_cost: float = 0.0) -> JudgedFit:
+            """Return a fit from theta on its meshes; `name` is what it is called on the line of progress."""
+            report = _write_to(line, name, callback)
+            return JudgedFit.take_over(
+                fit_on_meshes(evaluator, theta, hessian, tolerance, max_iterations, report, first_cost)
+            )
+
         prepared = measure_work()
         best, failure = None, None
         try:
-            best = fit(start, "fit")
+            at_start = Evaluator(problem, begin) if start is not None or own is None else own
+            best = fit(at_start, begin, "fit")
         except NotIntegrableError as error:
             if strategy == "local":
                 raise
@@ -108,15 +113,14 @@ def find_best_fit(
             is_over = hessian != "auto" or only_few
             if not is_over and is_enough(problem, best):
                 with limit_searches():
-                    others, rivals = find_other_minima(best)
+                    others, rivals = find_other_minima(best, own)
                 # A minimum that is deep, or that no beam can doubt, is left for a lower one near by alone; others are
                 # searched for in full.
                 only_others = not is_shallow(problem, best) or bool(explain_no_beam(problem))
                 is_over = only_others and not others
         if best is not None and is_over:
             return replace(best, rivals=rivals) if rivals else best
-        begin = problem.check_theta(start)
-        search = Search(problem, best, begin, strategy, fit, began, line, others, rivals, only_others)
+        search = Search(problem, own, best, begin, strategy, fit, began, line, others, rivals, only_others)
         search.has_budget = budget is not None
         search.run(limit_searches)
         # No search has found a start either: what was wrong with the guess says more than that.

@@ -9,7 +9,7 @@ import numpy as np
 
 from switchfit.arrays import FloatArray
 from switchfit.fit.search_record import Rival
-from switchfit.meshes.evaluator import evaluator_of
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.follower import Follower
 from switchfit.strategy.corner_paths import look_beyond_corners
 from switchfit.strategy.far_minima import find_far_minima
@@ -28,18 +28,20 @@ LEAST_GAIN_OF_MINIMUM = 0.1
 """By how much J has to be lower on another path for a fit: the data cannot tell less, and the model errs as much."""
 
 
-def find_other_minima(fit: JudgedFit) -> tuple[list[FloatArray], tuple[Rival, ...]]:
+def find_other_minima(fit: JudgedFit, own: Evaluator | None) -> tuple[list[FloatArray], tuple[Rival, ...]]:
     """Return starts at other minima that may be lower than the end of a good fit, the best first: in a transition time,
     or where the state meets corners in another way; and the minima in a time that the data do not tell from it.
+
+    `own` is the problem's own evaluator, whose meshes may be coarser than those of the fit: where they suit its end, a
+    look takes half the time. Without one, nothing is looked for.
     """
     evaluator, theta, scale = fit.evaluator_at_solution(), fit.theta, fit.variance_scale
     hops: list[FloatArray] = []
     rivals: dict[str, Rival] = {}
-    if not (fit.status.is_strict_minimum and scale > 0.0):
+    if own is None or not (fit.status.is_strict_minimum and scale > 0.0):
         return hops, ()
     try:
-        first = evaluator_of(evaluator.problem)  # its meshes may be coarser: a look takes half the time
-        evaluator = first if Follower(first).suits(theta) else evaluator
+        evaluator = own if Follower(own).suits(theta) else evaluator
         cost = evaluator.cost(theta)
         errors = np.sqrt(np.diag(fit.held_covariance))  # 0 at kinks, which hold their times
         hops, close = find_far_minima(evaluator, theta, cost, errors, scale)

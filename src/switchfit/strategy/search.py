@@ -18,9 +18,10 @@ import numpy as np
 
 from switchfit.arrays import FloatArray
 from switchfit.fit.search_record import Rival, Step
+from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.integration_error import LARGE_INTEGRATION_ERROR
 from switchfit.optimize import Status
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, check_start
 from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.progress import Line
 from switchfit.strategy.known_order import explain_no_beam, find_times
@@ -79,6 +80,7 @@ class Search:
     """A search by several strategies in turn: the best fit so far, and a record of each step."""
 
     problem: Problem
+    own: Evaluator | None
     best: JudgedFit | None
     theta: FloatArray
     strategy: Strategy
@@ -175,7 +177,7 @@ class Search:
         starts = self.others
         for _ in range(MOST_MINIMA_LEFT):
             if not starts and self.best is not None and is_enough(self.problem, self.best, self.steps):
-                starts, self.rivals = find_other_minima(self.best)
+                starts, self.rivals = find_other_minima(self.best, self.own)
             before = self.lowest
             # The first start that leads lower is enough: the others were found beside a minimum that is not the best
             # any more.
@@ -225,7 +227,9 @@ class Search:
             evaluations = end.evaluations
             # A short fit ends at a loose tolerance; only an end that is lower is worth the full one.
             if self._is_lower(end.cost):
-                fit = self.fit(end.theta, f"{name}, fit of its end", np.nan_to_num(self.first_cost))
+                theta = check_start(self.problem, end.theta)
+                named = f"{name}, fit of its end"
+                fit = self.fit(Evaluator(self.problem, theta), theta, named, np.nan_to_num(self.first_cost))
                 evaluations += fit.evaluations
                 # Asked of the full fit again: on its own meshes it may not be lower, and what it meets may violate
                 # constraints.
