@@ -56,9 +56,10 @@ def fit_locally(
     ValueError
         For a bad setting.
     """
+    began = time.perf_counter()
     first = check_start(problem, start)
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, first)
-    return fit_on_meshes(evaluator, first, hessian, tolerance, max_iterations, callback)
+    return fit_on_meshes(evaluator, first, hessian, tolerance, max_iterations, callback, began=began)
 
 
 def fit_on_meshes(
@@ -69,18 +70,19 @@ def fit_on_meshes(
     max_iterations: int,
     callback: Callable[[IterationRecord], object] | None = None,
     first_cost: float = 0.0,
+    began: float | None = None,
 ) -> SolvedFit:
     """Fit the problem of an evaluator once, from a start (d,) that has been checked and for which its meshes are.
 
     `first_cost` is J at the start of a search that ends with this fit: a large one is the scale of the integration
-    error. Raises ValueError for a bad setting.
+    error. Its seconds count from `began`, by default from here. Raises ValueError for a bad setting.
     """
     problem, theta = evaluator.problem, start
     hessian = as_choice(hessian, "hessian", HESSIANS)
     tolerance, max_iterations = check_settings(tolerance, max_iterations)
     if problem.constraint_names and hessian not in ("auto", "exact"):
         raise ValueError(f"with guards or terminal constraints hessian must be 'auto' or 'exact'; got {hessian!r}.")
-    began = time.perf_counter()
+    began = time.perf_counter() if began is None else began
     history: list[IterationRecord] = []
     evaluations, multipliers, broken = 0, None, None
     meshes = evaluator
