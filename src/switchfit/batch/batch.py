@@ -185,6 +185,7 @@ class Batch:
             return Outcome.at_starts(starts, np)
         outcome: Outcome = jax.tree.map(lambda a: a[: len(starts)], found)
         # A program has one mesh for all fits: it is refused where it does not suit the first and the last of them.
+        # The program takes all fits or none, so that these two stand for the others.
         is_sharp = self.layout.natively and not all(map(Follower(self.evaluator).suits, outcome.theta[[0, -1]]))
         return Outcome.at_starts(starts, np) if is_sharp else outcome
 

@@ -124,9 +124,12 @@ class Bootstrap(Fits):
             return found
         tails = np.array([0.5 - level / 2, 0.5 + level / 2])
         for k in np.flatnonzero(self.resampled):
+            # Ties count half: unknowns at a bound give many estimates of one value.
             below = (np.sum(theta[:, k] < self.estimate[k]) + np.sum(theta[:, k] <= self.estimate[k])) / 2
             # Where all lie on one side, as at a bound, there is no shift to be found.
             inside = float(np.clip(below / len(theta), 0.5 / len(theta), 1 - 0.5 / len(theta)))
+            # z0 is the bias of the median in standard deviations; z0 + z / (1 - a z), with z = z0 + the normal
+            # quantile, is where the quantile is read ([5]_).
             z0 = special.ndtri(inside)
             shifted = z0 + special.ndtri(tails)
             found[k] = np.quantile(theta[:, k], special.ndtr(z0 + shifted / (1 - self.acceleration[k] * shifted)))
@@ -193,6 +196,8 @@ def bootstrap(
         raise ValueError(f"block is the length of blocks: give it with resample='blocks', not with {resample!r}.")
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
     how = LongRun.check(tolerance, max_iterations, client, folder, callback)
+    # Away from a minimum residuals are not noise, and fits of resampled data would leave the estimate as it would
+    # itself.
     if not estimate.status.successful:
         raise ValueError(f"a bootstrap begins at a minimum, and this fit has not found one: {estimate.message}")
     problem = estimate.evaluator_at_solution().problem
@@ -201,6 +206,7 @@ def bootstrap(
     if resample == "runs":
         if len(problem.experiments) < 2:
             raise ValueError("resample='runs' needs two experiments or more; this problem has one. Take 'residuals'.")
+        # The data stay, only weights change: the meshes of the fit are right for every run.
         meshes = list(estimate.evaluator_at_solution().meshes)
         study: Study = StudyOfRuns(problem, meshes, estimate.theta[None], how.limits, seed)
         resampled[np.concatenate([where[where >= 0] for where in problem.unknowns.times])] = False
@@ -241,7 +247,9 @@ def _compute_acceleration(estimate: Estimate, *, by_run: bool) -> FloatArray:
     gradients = found.scores
     if by_run:
         runs = len(estimate.trajectories)
+        # A run that is drawn is drawn as a whole: its samples have one influence together.
         gradients = np.array([gradients[found.experiment == e].sum(0) for e in range(runs)])
+    # On the free directions: an unknown that is held has no influence and no acceleration, 0 / 0.
     influence = -gradients @ inverse_on(estimate.free_basis, estimate.hessian)
     spread = np.sum(influence**2, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):

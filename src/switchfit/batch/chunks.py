@@ -65,15 +65,19 @@ def run_chunks(
     ValueError
         If the folder holds the chunks of something else.
     """
+    # The cut does not depend on the cores: with the same folder another machine finds the same chunks.
     chunks = [range(first, min(first + work.size, count)) for first in range(0, count, work.size)]
+    # The fingerprint is computed once, not for each chunk: it digests all data.
     store = None if folder is None else ChunkStore(folder, work.fingerprint())
     stored = {chunk: store.load(chunk) if store else None for chunk in chunks}
     results = {chunk: arrays for chunk, arrays in stored.items() if arrays is not None}
     missing = [chunk for chunk in chunks if chunk not in results]
     done = count - sum(map(len, missing))
+    # What was found on disk counts for the bar at once.
     stopped = done > 0 and progress(done, count)
     if missing and not stopped:
         computed = _run_in_threads(work, missing) if client is None else _run_on_cluster(work, missing, client)
+        # Ctrl-C ends the loop, not the run: what is done is returned. `closing` cancels what has not begun.
         with closing(computed), suppress(KeyboardInterrupt):
             for chunk, arrays in computed:
                 results[chunk] = arrays
@@ -82,9 +86,11 @@ def run_chunks(
                 done += len(chunk)
                 if progress(done, count):
                     break
+    # Nothing is done that could be returned.
     if not results:
         raise KeyboardInterrupt
     finished = [chunk for chunk in chunks if chunk in results]
+    # In the order of `chunks`, not of their ends: results do not depend on how threads were scheduled.
     runs = np.concatenate([np.asarray(chunk) for chunk in finished])
     return runs, {name: np.concatenate([results[chunk][name] for chunk in finished]) for name in results[finished[0]]}
 
@@ -112,7 +118,10 @@ def _run_on_cluster(work: Any, chunks: list[range], client: Any) -> Generator[tu
     import cloudpickle
     import distributed
 
+    # Once for all chunks; a study may hold many megabytes of data.
     blob = cloudpickle.dumps(work)
+    # pure=False: Dask would otherwise name tasks by a hash of their arguments, and hand back what an earlier run has
+    # left.
     shared, each = client.submit(_receive, blob, pure=False), {"pure": False, "retries": MOST_RETRIES}
     futures = {client.submit(_run_remotely, shared, chunk, **each): chunk for chunk in chunks}
     try:

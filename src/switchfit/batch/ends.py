@@ -65,8 +65,10 @@ class Chunk(Ends):
     @classmethod
     def of(cls, outcome: Outcome) -> Chunk:
         """Return the outcomes of R fits as if all of them had converged, without covariances."""
+        # Copies: arrays that come from JAX cannot be written to.
         found = {name: np.array(getattr(outcome, name)) for name in Outcome._fields[:7]}
         R, d = outcome.theta.shape
+        # Arrays of objects, since text in a fixed-width array would be cut off at the length of the first message.
         texts: list[NDArray[Any]] = [np.full(R, text, dtype=object) for text in (Status.CONVERGED.name, "")]
         unknown, kinks = np.full((R, d, d), np.nan), np.zeros((R, d, 2))
         return cls(**found, status=texts[0], message=texts[1], free=np.full(R, d), kinks=kinks, covariance=unknown)
@@ -75,11 +77,13 @@ class Chunk(Ends):
         """Replace the k-th fit by another one, with its kinks; iterations and evaluations of both are added."""
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):
             getattr(self, name)[k] = getattr(found, name)
+        # The work of the first try was done too.
         self.iterations[k] += found.iterations
         self.evaluations[k] += found.evaluations
         self.status[k], self.message[k] = found.status.name, message
         self.free[k] = found.free_basis.shape[1]
         self.covariance[k] = inverse_on(found.free_basis, found.hessian)
+        # The first try may have ended at other kinks.
         self.kinks[k] = 0.0
         for place, left, right in kinks:
             self.kinks[k, place] = left, right
@@ -96,6 +100,7 @@ class Chunk(Ends):
     def clear_fit(self, k: int, error: BaseException) -> None:
         """Leave nothing of the k-th fit but the error with which it failed before it began."""
         for array in vars(self).values():
+            # Numbers of a fit that never began must not enter a mean or a median.
             array[k] = np.nan if array.dtype.kind == "f" else 0
         self.set_error(k, error)
 

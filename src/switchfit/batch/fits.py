@@ -184,11 +184,15 @@ class Fits(Ends, Tabular, Displayed):
                 [0.38, 0.4 ]]])
         """
         level = as_level(level)
+        # At least 1: below that Student's t has no quantile.
         freedom = np.maximum(self.samples + self.priors - self.free, 1)
         quantile = measure_quantile(level, freedom, self.sigma_known)
         half = quantile[:, None] * self.standard_errors
         log = np.isin(self.theta_names, self.log_scaled)
+        # A standard error of 0 is that of an unknown which is held, not of one that is known exactly.
         found = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins)
+        # J may rise by half the squared quantile, in units of the noise: the interval of the profile where there are
+        # pieces.
         thresholds = 0.5 * quantile**2 * measure_variance(self.cost, freedom, self.sigma_known)
         return replace_intervals(found, self.pieces, self.piece_places, thresholds)
 
@@ -200,6 +204,7 @@ class Fits(Ends, Tabular, Displayed):
         """
         ranks = np.array([VERDICT_LEVELS.index(level) for level in self.levels.tolist()], dtype=np.intp)
         misfit = self.cost / np.maximum(self.samples, 1)
+        # The last key counts most: failed fits first, then by level, then by misfit.
         return np.lexsort((-np.nan_to_num(misfit, nan=np.inf), -ranks, self.success))
 
     def plot(self) -> Figure:
@@ -247,6 +252,7 @@ class Fits(Ends, Tabular, Displayed):
         content = {"format": FITS_FORMAT, "version": FITS_VERSION, "kind": kind.__name__, "fits": to_json(self, rest)}
         if isinstance(best := getattr(self, "best", None), Estimate):
             content["best"] = describe_best(best)
+        # Everything that is no array is JSON, as bytes in one more array: nothing in the archive is pickled.
         header = np.frombuffer(json.dumps(content, allow_nan=False).encode(), dtype=np.uint8)
         write_arrays({name: getattr(self, name) for name in arrays} | {"header": header}, file)
 
@@ -280,6 +286,7 @@ class Fits(Ends, Tabular, Displayed):
             raise ValueError(f"{file} {'is damaged' if arrays else 'does not hold saved fits'}: {reason}.")
         header = arrays.pop("header", np.zeros(0, np.uint8)).tobytes()
         content = parse_document(header, file, "a file of saved fits", FITS_FORMAT, FITS_VERSION)
+        # `Fits.load` reads any kind; `Multistart.load` its own alone.
         kinds = {each.__name__: each for each in (cls, *cls.__subclasses__())}
         if (name := content.get("kind")) not in kinds:
             raise ValueError(
@@ -287,6 +294,7 @@ class Fits(Ends, Tabular, Displayed):
             )
         kind: type[Any] = kinds[name]
         try:
+            # The best estimate of a multistart is a saved fit inside the file, which no table of fields describes.
             nested = {"best": load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
             others = vars(from_json(split_fields(kind)[1], content.get("fits"), "fits"))
             found: Self = kind(**arrays, **others, **nested)
@@ -328,6 +336,7 @@ def build_reason(fits: Fits, doubt: Doubt) -> Issue:
     """Return a reason with the number of fits that it is about, the worst of them and how much that explains."""
     figures = {"count": float(doubt.which.sum()), "fits": float(len(doubt.which))}
     if doubt.kind == "not converged":
+        # The commonest ending first: it is what a remedy should be about.
         endings = Counter(fits.status[doubt.which].tolist()).most_common()
         return Issue("some not converged", tuple(name for name, _ in endings), figures)
     worst = _find_worst(fits, doubt.which)
@@ -338,4 +347,5 @@ def _find_worst(fits: Fits, which: NDArray[np.bool_]) -> int:
     """Return the place of the worst of some fits: the one that explains least, if any does."""
     places = np.flatnonzero(which)
     shares = fits.explained[places]
+    # No share is known where J is no sum of squares; one is then as bad as any other.
     return int(places[0] if np.isnan(shares).all() else places[np.nanargmin(shares)])

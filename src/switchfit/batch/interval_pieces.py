@@ -80,6 +80,7 @@ def trace_chunk(chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], ba
         walks, chunk.cost[fits], evaluate, MOST_PIECES_OF_SIDE, groups[0][0].unknowns.times
     )
     found[fits, rows, (walks.side + 1) // 2] = pieces
+    # An interval from one traced side and one parabola would mix two kinds of ends.
     incomplete = np.isnan(found[:, :, :, 0, 0]).any(axis=2)
     found[incomplete] = np.nan
     return found
@@ -107,10 +108,12 @@ def _list_walks(
     ends = problem.ends_of_modes(theta)
     for row, (e, place) in enumerate(ways.list_transitions(problem)):
         tau, samples = theta[:, place], ways.stack_sample_times(problem, theta, e)
+        # Ends of modes contain the time itself; a second equal one is a mode of no length.
         collapsed = np.sum(ends[e] == tau[:, None], axis=1) > 1  # ties it to another time
         held = (chunk.status[fits] == AT_KINK) & chunk.at_kink[fits, place]
         with np.errstate(invalid="ignore"):
             within = np.abs(samples - tau[:, None]) <= (quantile * errors[:, place])[:, None]
+        # Within the interval that one parabola gives; what the profile says is not known yet.
         few = np.sum(within, axis=1) <= MOST_SAMPLES_WITHIN_INTERVAL
         taken = ~collapsed & (held | (few & transition_profiles.is_any_near(samples, tau, errors[:, place])))
         if taken.any():

@@ -51,6 +51,7 @@ class StudyOfLogs(Study):
             meshes = evaluator_of(self.problems[members[0]]).meshes
             parts.append(super(StudyOfLogs, self._select(members, meshes)).__call__(range(len(members))))
             order += members
+        # Groups have mixed the runs; this is the inverse of the order in which they were done.
         place = np.argsort(order)
         return {name: np.concatenate([part[name] for part in parts])[place] for name in parts[0]}
 
@@ -101,6 +102,8 @@ def _get_kind(problem: Problem) -> tuple[object, ...]:
     numbers = [unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, *problem.places]
     numbers += [*unknowns.priors, *unknowns.variables]
     times = [experiment.initial_times_with_jumps for experiment in problem.experiments]
+    # Fixed transition times are constants of the program's inputs, of which a group has one set; free ones are in
+    # theta.
     fixed = [np.where(where[: len(t)] < 0, t, 0.0) for where, t in zip(problem.places, times, strict=True)]
     return evaluator.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))
 

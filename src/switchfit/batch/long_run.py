@@ -73,6 +73,7 @@ def repeat(problem: Problem, work: Any, count: int, title: str, how: LongRun) ->
     with show_progress(how.callback, title) as progress:
         runs, arrays = run_chunks(work, count, client=how.client, folder=how.folder, progress=progress)
     known, priors, unknowns = problem.is_sigma_known, count_priors(problem), problem.unknowns
+    # Covariances of chunks are not scaled: where sigma is unknown, each fit has a residual variance of its own.
     variance = measure_variance(arrays["cost"], arrays["samples"] + priors - arrays["free"], known)
     return arrays | {
         "covariance": variance[:, None, None] * arrays["covariance"],

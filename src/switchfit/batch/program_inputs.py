@@ -80,6 +80,7 @@ class ProgramInputs(NamedTuple):
         """
         arguments, d = replace_leaves(self.arguments, layout.varying, own), theta.shape[0]
         J, g, curvature = self.priors.evaluate(theta, jnp)
+        # One place more than theta: the index d reads 0 and, with mode="drop", writes nowhere.
         H, extended = jnp.diag(curvature), jnp.append(theta, 0.0)
         for group in _group_experiments(layout, arguments, self):
             structure, N = layout.structures[group[0]], len(self.times[group[0]])

@@ -42,6 +42,7 @@ COMPILE_LOCK, GPU_LOCK = threading.Lock(), threading.Lock()
 @contextmanager
 def compile_once(layout: ProgramLayout, given: object) -> Iterator[None]:
     """Compile the program in the first call that needs it, using the compilation cache; other threads wait."""
+    # JAX compiles for each set of shapes; two threads that ask at once would compile twice.
     key = (layout, tuple(np.shape(leaf) for leaf in jax.tree.leaves(given)))
     with COMPILE_LOCK:
         if key not in _known:

@@ -49,8 +49,10 @@ def _choose_block(estimate: Estimate, longest: int) -> int:
     lengths = [1.0]
     for channel in estimate.residuals.channels:
         if channel.correlation > 0:
+            # The length grows without bound at 1, which neighbours of a log with a trend may have by rounding.
             r = min(channel.correlation, 0.99)
             lengths.append((np.sqrt(6) * r / (1 - r**2)) ** (2 / 3) * len(channel.values) ** (1 / 3))
+    # Two blocks at least: of one there is nothing to draw.
     return max(1, min(round(max(lengths)), longest // 2))
 
 
@@ -59,11 +61,13 @@ class ResampledNoise:
 
     def __init__(self, estimate: Estimate, problem: Problem, resample: str, block: int | None) -> None:
         self.resample, self.block = resample, 1
+        # Residuals of a fit are smaller than the noise, by the share of the unknowns.
         inflation = np.sqrt(estimate.samples / max(estimate.freedom, 1))
         self.items = [item for experiment in problem.experiments for item in experiment.data]
         self.pools: list[FloatArray] = []
         for item, comparison in zip(self.items, chain.from_iterable(estimate.comparisons), strict=True):
             residuals = inflation * comparison.residuals / _get_sigma(item)
+            # A random sign makes the mean 0 by itself, and centring would change values that stay at their places.
             self.pools.append(residuals if resample == "wild" else residuals - np.nanmean(residuals, axis=0))
         if resample == "blocks":
             longest = max(map(len, self.pools))
@@ -73,11 +77,14 @@ class ResampledNoise:
 
     def __call__(self, rng: np.random.Generator, clean: FloatArray, item: Any) -> FloatArray:
         """Return drawn residuals for the values of a data item, around the clean ones: (K, q)."""
+        # By identity: two `Measurements` with equal arrays are two sensors, and equality of arrays is no bool.
         pool = next(pool for own, pool in zip(self.items, self.pools, strict=True) if own is item)
         K = len(pool)
         if self.resample == "wild":
+            # One sign a moment for all channels: what they have in common at that moment stays.
             drawn = np.nan_to_num(pool) * rng.choice([-1.0, 1.0], size=(K, 1))
         else:
+            # Blocks begin anywhere and go round the end, so that every residual is drawn as often as any other ([3]_).
             first = rng.integers(K, size=(-(-K // self.block), 1))
             drawn = pool[((first + np.arange(self.block)) % K).ravel()[:K]]
             # Where a moment was drawn at which a channel has no value, that channel draws by itself.

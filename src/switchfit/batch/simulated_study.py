@@ -49,6 +49,7 @@ def build_study(
     clean = _simulate_clean(problem, truth)
     drawn = noise if callable(noise) else _find_spreads(problem, truth, noise, clean)
     study = SimulatedStudy(problem, [], begin[None], limits, seed, drawn, clean)
+    # The meshes depend on sample times, not on values: those of run 0 serve all.
     study.meshes, error = _build_meshes(study.problem_of(0), truth, begin)
     return study, error
 
@@ -56,6 +57,7 @@ def build_study(
 def _simulate_clean(problem: Problem, truth: FloatArray) -> Values:
     """Return what data would be without noise."""
     found: Values = {}
+    # On half the steps, so that the error of the simulation is far below that of the fits' own mesh.
     comparisons = compare(Evaluator(problem, truth).divide(2), truth)[1]
     for e, (experiment, run) in enumerate(zip(problem.experiments, comparisons, strict=True)):
         places = [k for k, item in enumerate(experiment.data) if isinstance(item, Measurements)]
@@ -70,6 +72,7 @@ def _find_spreads(problem: Problem, truth: FloatArray, noise: Any, clean: Values
     found = {}
     for (e, k), values in clean.items():
         item, sigma = problem.experiments[e].data[k], noise
+        # A sigma that is a parameter has its value at the truth.
         if sigma is None:
             sigma = item.noise(problem.name_parameters(truth, e))
         if sigma is None:
@@ -100,9 +103,11 @@ def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tup
         fine = halve_rows(evaluator, truth).cost(truth)
         # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
         error = cost_error(problem, fine, evaluator(truth).cost, evaluator(start).cost)
+        # No finer than rtol asks for. NaN, where J cannot be evaluated, ends the loop as well.
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if not excess > 1 or attempt == REFINEMENTS:
             break
+        # The error falls with the power of the order; 10 % more, since it is an estimate.
         finer *= 1.1 * excess ** (1 / ORDER_OF_METHODS)
     return evaluator.meshes, float(error)
 
@@ -124,9 +129,11 @@ class SimulatedStudy(Study):
 
     def draw_run(self, run: int) -> Values:
         """Return the values of one run."""
+        # A generator a run: draws do not depend on which chunk, thread or machine does it.
         rng, drawn = np.random.default_rng([self.seed, run]), {}
         for (e, k), clean in self.clean.items():
             if callable(self.noise):
+                # A copy: a function that adds noise in place would change the clean data of all later runs.
                 noisy = self.noise(rng, clean.copy(), self.problem.experiments[e].data[k])
                 values = as_array(noisy, "what noise(rng, clean, item) returns")
             else:
@@ -151,17 +158,21 @@ class SimulatedStudy(Study):
             try:
                 drawn.append(self.draw_run(run))
             except Exception as error:  # listed: it must not end the other runs
+                # A row for the program, whose result is thrown away (`clear_fit`).
                 drawn.append(self.clean)
                 errors[place] = error
         return self.stack_values({key: np.stack([values[key] for values in drawn]) for key in self.clean}), errors
 
     def stack_values(self, values: Values) -> Varying:
         """Return noisy values (R, K, q) of all data as leaves of the arguments."""
+        # Values stand among the leaves of JAX's tree of arguments: the same tree of places says which.
         (leaves, places), changed = self.leaves, {}
         for e, experiment in enumerate(self.problem.experiments):
             measured = [(k, item) for k, item in enumerate(experiment.data) if isinstance(item, Measurements)]
             for samples, (k, item) in zip(places[e].samples, measured, strict=True):
                 own, leaf = values[e, k], samples.value
+                # The arrays of a program are padded to a common length; beyond the samples the weights are 0, and so
+                # are missing values.
                 changed[leaf] = np.zeros((len(own), *leaves[leaf].shape))
                 changed[leaf][:, : len(item.times)] = np.where(np.isnan(item.values), 0.0, own)
         return changed

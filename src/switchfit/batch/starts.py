@@ -187,6 +187,7 @@ def _find_best(problem: Problem, fits: Fits, limits: Limits) -> tuple[Fits, Esti
     """Return a full estimate, resumed at the lowest end that allows one, and the fits with the errors of lower ends."""
     status, message = fits.status.astype(object), fits.message.astype(object)
     best = None
+    # Converged ends first, the lowest of them first.
     for k in np.lexsort((np.nan_to_num(fits.cost, nan=np.inf), ~fits.success))[:ENDS_TRIED].tolist():
         start = fits.theta[k] if np.isfinite(fits.theta[k]).all() else fits.start[k]
         try:
@@ -205,6 +206,7 @@ def _check_starts(problem: Problem, starts: object) -> FloatArray:
         raise ValueError(f"starts must be a number, or an array of shape (S, {d}); got shape {points.shape}.")
     constraints = problem.constraints
     for k, point in enumerate(points):
+        # Rounding of a start that was computed, as on a bound, is no violation.
         slack = constraints.slack(problem.check_theta(point, f"starts[{k}]"))
         if np.any(slack < -1e-12 * (1 + np.max(np.abs(point)))):
             raise ValueError(f"start {k} violates: {constraints.names[int(np.argmin(slack))]}.")
@@ -217,6 +219,8 @@ def _find_clusters(fits: Fits) -> NDArray[np.int64]:
     found, lowest = -1, -np.inf
     for k in ended[np.argsort(fits.cost[ended], kind="stable")].tolist():
         cost = float(fits.cost[k])
+        # Compared with the lowest of the cluster, not with its neighbour: a chain of small steps would join minima that
+        # differ.
         if not cost - lowest <= SAME_COST * max(abs(cost), 1e-300):
             found, lowest = found + 1, cost
         labels[k] = found

@@ -66,6 +66,7 @@ def judge_study(
     if failed > FORGIVEN_SHARE * R:
         level: Level = "bad" if failed >= HALF * R else "doubtful"
         found.append(Finding(level, build_reason(fits, Doubt("not converged", level, ~ended)), ("see failures",)))
+    # A median and its deviation, since another minimum pulls means and standard deviations along.
     distances = _measure_distances(fits, shared)
     elsewhere = distances > ELSEWHERE_FROM
     if elsewhere.any():
@@ -120,9 +121,11 @@ def _measure_distances(fits: Fits, considered: NDArray[np.bool_]) -> FloatArray:
     centre = np.median(theta, axis=0)
     deviation = np.abs(theta - centre)
     errors = fits.standard_errors[ended]
+    # A standard error says how far noise spreads where most fits end at the same place to rounding, as at a kink.
     usual = np.array([np.median(e[np.isfinite(e)]) if np.isfinite(e).any() else 0.0 for e in errors.T])
     spread = np.maximum(1.4826 * np.median(deviation, axis=0), usual)
     spread = np.where(spread > 0, spread, 1e-3 * np.maximum(np.abs(centre), 1e-300))
+    # An unknown that is not considered counts 0.
     found[ended] = np.max(deviation / spread * considered, axis=1)
     return found
 

@@ -80,6 +80,7 @@ class ModelComparison(Displayed):
     def aicc(self) -> FloatArray:
         """AIC corrected for few values: (m,); infinite with no more than k + 1 values."""
         left = self.values - self.unknown_counts - 1
+        # Divided by 1 where nothing is left, only to be replaced by infinity.
         more = 2 * self.unknown_counts * (self.unknown_counts + 1) / np.where(left > 0, left, 1)
         return np.where(left > 0, self.aic + more, np.inf)
 
@@ -91,6 +92,7 @@ class ModelComparison(Displayed):
     @property
     def delta_aicc(self) -> FloatArray:
         """AICc less the smallest: (m,); NaN if all are infinite."""
+        # inf - inf: no model has values left.
         with np.errstate(invalid="ignore"):
             return np.asarray(self.aicc - self.aicc.min())
 
@@ -102,6 +104,7 @@ class ModelComparison(Displayed):
     @property
     def weights(self) -> FloatArray:
         """Akaike weights from AICc: (m,), with the sum 1; NaN if all AICc are infinite."""
+        # Differences first: exp(-AICc / 2) alone underflows.
         weight = np.exp(-0.5 * self.delta_aicc)
         return np.asarray(weight / weight.sum())
 
@@ -170,6 +173,7 @@ def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None
     likelihoods = np.array([compute_log_likelihood(p, fit.comparisons) for p, fit in zip(problems, fits, strict=True)])
     # k: all of theta, less its equality constraints, and an unknown variance.
     unknowns = np.array([len(fit.theta) - len(fit.constraints) + (fit.sigma_known is False) for fit in fits])
+    # All have the same data (`_check_data`).
     count = sum(item.count for item in problems[0].measurements)
     return ModelComparison(labels, count, unknowns, likelihoods, tuple(fits))
 
@@ -210,6 +214,7 @@ def find_difference(first: Problem, second: Problem) -> str:
             return f"{len(items[0])} and {len(items[1])} Measurements{where}"
         for a, b in zip(*items, strict=True):
             for what, x, y in (("times", a.times, b.times), ("values", a.values, b.values)):
+                # Shapes first: `array_equal` is False for them without saying why.
                 if x.shape != y.shape:
                     return f"{what}{where} of shape {x.shape} and {y.shape}"
                 if not np.array_equal(x, y, equal_nan=True):

@@ -362,6 +362,7 @@ class Estimate(JudgedFit, Tabular, Displayed):
         """
         if given is not None:
             return as_instance(given, "provenance", Provenance, "the provenance of a problem file")
+        # A loaded fit keeps what it was made from; one that was made here is of these versions.
         return self.provenance if self.saved_certificate is not None else Provenance()
 
     def save_report(self, path: str | Path, *, provenance: Provenance | None = None) -> None:

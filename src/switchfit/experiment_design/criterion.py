@@ -57,13 +57,19 @@ class Criterion(NamedTuple):
         xp : module, optional
             NumPy or `jax.numpy`.
         """
+        # In units of typical standard errors F is about 1, and the ridge small against it, whatever the units of theta
+        # are.
         basis = self.basis * self.size[None, :]
         across = basis[self.chosen] / self.scales[:, None]
         half = across @ xp.linalg.inv(basis.T @ information @ basis + INFORMATION_RIDGE * xp.eye(len(self.size)))
         values, vectors = xp.linalg.eigh(half @ across.T)
         logs = xp.log(xp.maximum(values, 1e-300))
+        # Powers of eigenvalues relative to the largest, since v^1000 overflows.
         parts = xp.exp(power * (logs - logs[..., -1:]))
+        # For power 0 the limit: the mean of the logarithms, log det C / s.
         mean = xp.log(parts.mean(-1)) / power + logs[..., -1] if power else logs.mean(-1)
+        # d log m / d v_i = v_i^(q - 1) / sum v^q, and dC / dF = -A F^-1 . F^-1 A': a negative semidefinite matrix, as
+        # more information never makes m larger.
         weights = parts / parts.sum(-1, keepdims=True) / xp.exp(logs)
         root = xp.sqrt(weights)[..., None] * (xp.swapaxes(vectors, -1, -2) @ half @ basis.T)
         return mean, -xp.swapaxes(root, -1, -2) @ root

@@ -66,15 +66,20 @@ def differentiate_criterion(
     """Return log m, as of `Criterion.rate`, and its derivatives in an input at its knots, (K, q)."""
 
     def rate(inputs: Array) -> Array:
+        # The signal is linear in its values at the knots: cubics of unit inputs, times the table.
         model = Model(structure, at.arguments._replace(signals=jnp.einsum("gck,kq->gcq", at.cells, inputs)))
 
         def inform(side: Array) -> Array:
+            # Forward in a few unknowns, where the whole is differentiated backward in the many values of the input.
             slopes, weights = jax.jacfwd(partial(_see, model, side), has_aux=True)(at.theta)
             own = jnp.zeros((at.theta.size, at.theta.size))
             for taken, (C, L), w in zip(at.taken, slopes, weights, strict=True):
+                # sum C'C / sigma^2 of the samples that are taken, and 2 (D log sigma)' D log sigma where sigma is a
+                # parameter.
                 own += jnp.einsum("k,kqd,kq,kqe->de", taken, C, w, C) + 2.0 * jnp.einsum("k,kqd,kqe->de", taken, L, L)
             return own
 
+        # One side after the other in a loop: the program is compiled once, not twice as large.
         own = jax.lax.map(inform, jnp.array(SIDES, dtype=float)).mean(0)
         return at.criterion.rate(at.others + at.places @ own @ at.places.T, power, jnp)[0]
 
@@ -125,12 +130,14 @@ def improve_input(
 
     def place(x: FloatArray) -> FloatArray:
         table = lower.copy()
+        # The optimiser's variables are in [0, 1]: inputs of any unit have one scale.
         table[free] += x * width[free]
         return table
 
     def rate(x: FloatArray) -> tuple[float, FloatArray]:
         value, slope = differentiate_criterion(place(x), background, structure=structure, power=power)
         slope = np.asarray(slope * width)[free]
+        # Flat and high: the line search of L-BFGS-B comes back from where the model cannot be integrated.
         return (float(value), slope) if np.isfinite([value, *slope]).all() else (UNUSABLE, np.zeros_like(slope))
 
     found = []
@@ -138,6 +145,7 @@ def improve_input(
         for start in starts:
             x = np.clip((start - lower)[free] / width[free], 0.0, 1.0)
             found.append(minimize(rate, x, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(x)))
+    # Local optima of several starts; the lowest is taken.
     return place(min(found, key=lambda end: end.fun).x)
 
 
@@ -145,6 +153,7 @@ def _describe(here: Nominal, criterion: Criterion, taken: Sequence[NDArray[np.bo
     """Return what does not change."""
     problem, e, mesh = here.problem, here.e, here.evaluator.meshes[here.e]
     run, mesh = problem.experiments[e], mesh.pad_to(1 << mesh.cells.bit_length())  # few lengths: few programs
+    # One channel for each knot, with 1 there and 0 at all others.
     knots = replace(run.inputs, values=np.eye(len(run.inputs.times)), units=None)
     (own, mine), (tau, p) = problem.own_places[e], problem.vectors(here.theta, e)
     places = np.zeros((len(here.theta), len(problem.places[e])))
@@ -154,6 +163,7 @@ def _describe(here: Nominal, criterion: Criterion, taken: Sequence[NDArray[np.bo
         arguments=build_arguments(problem, e, mesh),
         cells=split_by_cell(knots.signal(run.t0, run.end), mesh),
         theta=np.append(tau, p),
+        # Padded as the samples in the arguments are, whose lengths are rounded up for the program.
         taken=tuple(np.pad(each.astype(float), (0, length - len(each))) for each, length in lengths),
         others=here.candidates.others,
         places=places,

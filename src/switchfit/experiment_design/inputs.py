@@ -67,10 +67,12 @@ def read_limits(run: Experiment, free: Mapping[str, Any]) -> tuple[FloatArray, F
         raise TypeError(f"free must be a dict of inputs and their limits; got {shorten(free)}.")
     names, ends = name_inputs(run), np.stack([stack_inputs(run)] * 2)
     for name, limits in free.items():
+        # "u" stands for all entries of an input that has no names.
         columns = [k for k, each in enumerate(names) if each == name or (name == "u" and each.startswith("u["))]
         if not columns:
             raise ValueError(f"free must name inputs of the run: {join_names(names)}; got {shorten(name)}.")
         try:
+            # Whatever does not broadcast, or is no pair, is told as one mistake with its remedy below.
             pair = np.stack([np.broadcast_to(arrays.as_array(limit, name), len(ends[0])) for limit in limits])
         except (TypeError, ValueError):
             pair = np.full((2, 1), np.nan)

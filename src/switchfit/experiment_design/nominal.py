@@ -44,6 +44,7 @@ class Nominal:
         if problem.constraint_names:
             self.evaluator, self.theta = place_on_guards(problem, theta)
             self.basis = find_free_directions(problem, self.evaluator.constrained(self.theta).jacobian)
+        # The Gauss-Newton matrix of values that are simulated at theta is the expected (Fisher) information.
         each_side = (self.evaluator(self.theta, side, matrix="gauss-newton").hessian for side in SIDES)
         self.information = 0.5 * sum(each_side, np.zeros((len(theta),) * 2))
         self.covariance = inverse_on(self.basis, self.information)
@@ -55,6 +56,8 @@ class Nominal:
         arguments, (own, mine) = self.evaluator.arguments[e], problem.own_places[e]
         counts = [len(item.times) for item in problem.experiments[e].data]
         for s, count in enumerate(counts):
+            # One sample at a time has a weight, all others 0: what J's matrix is then is the information of this
+            # sample.
             for k in range(count):
                 weights: list[Any] = [np.zeros_like(each.weight) for each in arguments.samples]
                 weights[s][k] = arguments.samples[s].weight[k]
@@ -64,7 +67,9 @@ class Nominal:
                 found.append(np.zeros_like(self.information))
                 for side in SIDES:
                     H = engine.derivatives(*problem.vectors(self.theta, e), side, "gauss-newton").hessian
+                    # Half of each side (`SIDES`); two names of a run may be one unknown.
                     np.add.at(found[-1], (mine[:, None], mine), 0.5 * H[own[:, None], own])
+        # What no candidate has: priors and other runs.
         return Candidates(np.repeat(np.arange(len(counts)), counts), np.array(found), self.information - sum(found))
 
 
@@ -81,6 +86,7 @@ def simulate_values(problem: Problem, e: int, theta: FloatArray, taken: list[NDA
         Sensors without any are left out.
     """
     run, data = problem.experiments[e], []
+    # Values of theta itself: residuals are 0, and J of the planned run has its minimum there.
     comparisons = compare(Evaluator(problem, theta), theta)[1][e]
     for item, comparison, kept in zip(run.data, comparisons, taken, strict=True):
         if kept.any():

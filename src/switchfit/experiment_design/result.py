@@ -113,6 +113,7 @@ class Design(DesignRecord, Printed):
         """
         u, errors = self.problem.unknowns, np.nan_to_num(self.standard_errors)
         beyond = (self.theta - errors < u.lower) | (self.theta + errors > u.upper)
+        # Rows of A are differences of neighbouring times: the error of either of them against the room between them.
         beyond |= np.any(np.abs(u.A) * errors > (u.A @ self.theta - u.b)[:, None], axis=0)
         return tuple(np.array(self.theta_names)[beyond].tolist())
 

@@ -52,11 +52,13 @@ def choose_samples(
     """
     sensor, each = candidates.sensor, candidates.information
     taken = most[sensor] > 0
+    # One at a time, since two samples that tell the same are both missed least until one of them is gone.
     while (over := np.flatnonzero(taken & (np.bincount(sensor, taken, len(most)) > most)[sensor])).size:
         taken[over[np.argmin(rate(candidates.add(taken) - each[over]))]] = False
     value, improved = float(rate(candidates.add(taken))), True
     while improved:
         improved = False
+        # All exchanges of one sample in one call of `rate`. Of the same sensor: another would break a limit.
         for out in np.flatnonzero(taken):
             spare = np.flatnonzero(~taken & (sensor == sensor[out]))
             values = rate(candidates.add(taken) - each[out] + each[spare])

@@ -135,26 +135,37 @@ def design(
             "free cannot be used where transitions have guards, or modes have corners of the state (as jnp.sign of a "
             "state has): choose samples and sensors alone, and compare inputs by a call for each."
         )
+    # Everything is measured at first; a choice of samples follows inputs that were good for all of them.
     every = taken = [np.ones(len(item.times), dtype=bool) for item in run.data]
     before = here = Nominal(simulate_values(problem, e, nominal, every), e, nominal)
+    # Scaled by the problem as it was given, so that all designs of one search are rated by the same ridge.
     rule, power = _build_criterion(before, chosen, scales), POWERS[kind]
+    # The given input is among the starts: a design is never worse than it, for these samples.
     begin = [stack_inputs(run), *np.random.default_rng(seed).uniform(lower, upper, (starts, *lower.shape))]
     best, lowest = here, np.inf
+    # Without free inputs one choice of samples is all: a second turn would rate the same candidates.
     for _ in range(MOST_TURNS if free else 1):
         if free:
+            # Only the first turn has many starts; later ones go on from the best input.
             begin = [improve_input(here, rule, min(power, LARGEST_SMOOTH_POWER), taken, (lower, upper), begin)]
+            # A mesh of its own for the new input: its steps were chosen for the old one.
             changed = replace_inputs(before.problem, e, begin[0])
             here = Nominal(simulate_values(changed, e, nominal, every), e, nominal)
+        # Each largest set of sensors by itself: exchanges do not lead from one to another.
         choices = (choose_samples(here.candidates, own, lambda F: rule.rate(F, power)[0]) for own in most)
         value, chosen_samples = min(choices, key=lambda choice: choice[0])
         gain = lowest - value
         if gain > 0:
             best, lowest = here, value
             taken = np.split(chosen_samples, np.cumsum([len(each) for each in every])[:-1])
+        # Compared after the mesh is new, so that a gain which was integration error ends the turns.
         if gain < LEAST_GAIN_OF_TURN:
             break
+    # What is reported is computed from the problem that is handed out, not from a sum of candidates.
     planned = Nominal(simulate_values(best.problem, e, best.theta, taken), e, best.theta)
     slope = rule.rate(best.candidates.add(np.concatenate(taken)), power)[1]
+    # Derivative of log m along each sample's information. m is homogeneous of degree -1, so that those of all
+    # information that is taken add up to 1 (Euler).
     shares = -np.einsum("de,kde->k", slope, best.candidates.information)
     return Design(
         run=problem.run_names[e],

@@ -40,6 +40,7 @@ def list_sample_limits(
     for what, given in (("samples", counts), ("sensors", costs)):
         if unknown := [name for name in given if name not in labels]:
             raise ValueError(f"{what} names {shorten(unknown[0])}; the sensors are {join_names(labels)}.")
+    # Costs without a budget limit nothing, and a budget needs costs.
     if (budget is None) == isinstance(sensors, Mapping):
         raise ValueError("budget and the costs of sensors belong together: give sensors={name: cost} and budget.")
     whole = np.array([len(item.times) for item in run.data])
@@ -52,8 +53,10 @@ def list_sample_limits(
         raise ValueError(f"sensors can be chosen among {MOST_SENSORS}; there are {len(labels)}.")
     prices = np.array([as_positive(costs[name], f"cost of {name}") if name in costs else 0.0 for name in labels])
     most = as_count(sensors, "sensors", at_least=1) if budget is None else as_positive(budget, "budget")
+    # All sets of sensors, of which `MOST_SENSORS` keeps the number small.
     every = np.array(list(product((0, 1), repeat=len(labels))))
     allowed = every[every @ prices <= most]
+    # More sensors never tell less: sets inside an allowed one need not be tried.
     largest = [own for own in allowed if not any(np.all(other >= own) and np.any(other > own) for other in allowed)]
     if not np.any(largest):
         raise ValueError(f"no sensor is within the budget of {most:g}; got costs {shorten(dict(costs))}.")

@@ -44,7 +44,9 @@ class Certifier:
             times = keep_off(spread(schedule, library) or schedule, run.jump_times).times
             runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(times)))
         durations = dict(library.durations)
+        # A number where all are alike: durations by mode are for libraries whose modes differ.
         shortest = durations if len(set(durations.values())) > 1 else max(durations.values())
+        # The search may work more coarsely; what is reported has the tolerances that were asked for.
         rtol, atol = self.given.rtol, self.given.atol
         problem = replace(searched, experiments=runs, min_duration=shortest, rtol=rtol, atol=atol)
         first, acting = fitted.switches, fitted.acting

@@ -99,13 +99,17 @@ class Score:
             return np.inf
         if name == "cost":
             return float(cost + self.switch_cost * switches)
+        # log n must not be negative: then more unknowns would cost less.
         n = max(self.worth * max(self.values, 1), 1.0)
         if self.sigma_known is False:
+            # n log(2 J / n) is -2 log L but for a constant. J of data without noise is rounding, whose logarithm would
+            # choose.
             misfit, parameters = n * float(np.log(2 * max(cost, self.smallest) / self.values)), parameters + 1
         else:
             misfit = self.worth * 2 * cost / self.dispersion
         if name == "aicc":
             k = parameters + switches
+            # With no value left, AICc is infinite: such a fit can explain anything.
             left = n - k - 1
             return float(misfit + 2 * k + 2 * k * (k + 1) / left) if left > 0 else np.inf
         each = 2 if name == "mbic" else 1
@@ -118,6 +122,7 @@ class Score:
         ----------
         name : {"bic", "mbic", "aicc", "cost"}
         """
+        # Half of what the criterion adds for a switch, since criteria have 2 J and this is in units of J.
         log = float(np.log(max(self.values, 2)))
         return {"cost": self.switch_cost, "aicc": 1.0, "bic": 0.5 * log, "mbic": log}[name]
 
@@ -129,6 +134,7 @@ class Score:
         cost : float
         unknowns : int
         """
+        # At least 1: residuals smaller than sigma are no reason to believe the data more.
         freedom = self.values - unknowns
         return max(2 * cost / freedom, 1.0) if self.has_chi_square and freedom > 0 else 1.0
 
@@ -157,5 +163,6 @@ def compute_weights(criteria: Sequence[float] | FloatArray) -> FloatArray:
     given = np.asarray(criteria, dtype=float)
     if not np.isfinite(given).any():
         return np.full(len(given), np.nan)
+    # Less the smallest first: exp(-c / 2) alone underflows for the criteria of long logs.
     weights = np.exp(-0.5 * (given - given.min()))
     return np.asarray(weights / weights.sum())

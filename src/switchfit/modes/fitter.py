@@ -98,6 +98,7 @@ class Fitter:
         return [self._build_mesh(e) for e in range(len(self.runs))]
 
     def _build_mesh(self, e: int) -> Mesh:
+        # Other runs keep their sequences: the mesh is that of run e alone.
         own = [run.mode_sequence for run in self.problem.experiments]
         spaced = [self._space_evenly([*own[:e], tour, *own[e + 1 :]]) for tour in self._list_tours()]
         return refine_mesh_of_many([self._build_problem(schedules) for schedules in spaced if schedules], e)

@@ -75,6 +75,7 @@ class Judge:
         best = ranked[0][0]
         estimate = self.certifier.estimate(best) if best.has_unknowns else None
         weights, values = self._weigh(ranked), {fit.sequences: value for fit, value in ranked}
+        # By a criterion of the user's the best need not have the lowest J of its number of switches.
         shown = [best if fit.switches == best.switches else fit for fit in self.pool.by_switches.values()]
         return {
             "fitted": tuple(self._describe(fit, values, weights) for fit in shown),
@@ -97,6 +98,7 @@ class Judge:
         if self._chooses_by_cost or not np.isfinite(ranked[0][1]):
             return {ranked[0][0].sequences: 1.0}
         values = [self.pool.compute(fit, "mbic") if self._weighs_by_mbic else value for fit, value in ranked]
+        # The best is always among them, also where mBIC alone would leave it out.
         kept = [k for k, value in enumerate(values) if k == 0 or value <= min(values) + ALTERNATIVE]
         weights = compute_weights([values[k] for k in kept]).tolist()
         return {ranked[k][0].sequences: weight for k, weight in zip(kept, weights, strict=True)}

@@ -100,6 +100,7 @@ class Improver:
         taken: set[tuple[tuple[str, ...], ...]] = set()
         most = FITTED_PROPOSALS * len(self.spans)
         for proposal in sorted(proposals, key=lambda proposal: proposal.cost):
+            # The lowest proposal of each sequence: a fit moves the times anyway, but never to another sequence.
             if proposal.sequences not in taken and len(taken) < most:
                 taken.add(proposal.sequences)
                 given = zip(proposal.sequences, proposal.transition_times, self.spans, strict=True)
@@ -117,6 +118,8 @@ class Improver:
             moves = KINDS_OF_MOVES if self.fitter.shares_programs else KINDS_OF_MOVES[:1]
             if any(self._try(best, partial(self._fit_lowest, *move)) for move in moves):
                 continue
+            # Hops come last, when no move of modes helps, and once for each sequence: they take many evaluations of
+            # models.
             if best.sequences in hopped or not self._try(best, self._hop):
                 return
             hopped.add(best.sequences)
@@ -125,21 +128,26 @@ class Improver:
         """Try the moves of a kind; return whether the best is better."""
         before = self.pool.lowest
         move(best)
+        # Relative to 1 where the criterion is near 0: information criteria cross it.
         return self.pool.lowest < before - LEAST_FALL_OF_CRITERION * max(abs(before), 1.0)
 
     def _hop(self, best: Fitted) -> None:
         """Fit from other sample intervals until that does not help; the time of a transition with a guard follows."""
+        # Guards determine the times of their transitions: there is nothing to hop.
         here = None if best.guarded else best
         while here is not None:
             before, here = here, None
             ends = np.cumsum([schedule.switches for schedule in before.schedules])
+            # Parameters that act in no mode have zero rows in the Hessian, and are held as in a fit.
             free = np.append(np.ones(ends[-1], dtype=bool), before.acting)
             evaluator = self.fitter.get_evaluator(before.schedules)
             for theta in choose_hops(evaluator, before.theta, before.cost, free):
                 pairs = zip(before.schedules, np.split(theta, ends), strict=False)
+                # A hop of one time may lead past another; `polish` drops the mode that is left without a duration.
                 moved = [schedule.replace(schedule.sequence, np.sort(times)) for schedule, times in pairs]
                 found = self.polish(moved, theta[ends[-1] :], "hops over samples")
                 if is_lower(found.cost, before.cost):
+                    # Another sequence is in the pool now, and gets moves of its own.
                     here = found if found.sequences == before.sequences else None
                     break
 
@@ -152,6 +160,8 @@ class Improver:
         """Return all moves of a kind from the best, with their J at its parameters."""
         found = []
         for e, schedule in enumerate(best.schedules):
+            # All moves of a run in one call: of one sequence together, which machine code simulates without being
+            # assigned anew.
             every = list(list_moves(schedule, self.library))
             costs = self.fitter.compute_costs(best.schedules, e, every, best.parameters)
             found += [Move(*each, e) for each in zip(costs.tolist(), every, strict=True)]
@@ -164,7 +174,9 @@ class Improver:
         found: dict[tuple[int, tuple[str, ...]], Move] = {}
         for move in sorted(moves, key=lambda move: move.cost):
             if np.isfinite(move.cost):
+                # Sorted by cost, so that the first of a sequence is its lowest.
                 found.setdefault((move.e, move.schedule.sequence), move)
+        # J decides within a sequence; between sequences the criterion does, which counts switches.
         pairs = [(move.cost, self.place(best, move.e, move.schedule)) for move in found.values()]
         return sorted(pairs, key=lambda pair: self._expect(best, *pair))
 
@@ -213,6 +225,7 @@ class Improver:
         known these are far above the best in any case.
         """
         fitted = self.pool.by_switches.get(switches)
+        # The best has been moved in every way already.
         if fitted is None or fitted is best or self.pool.score.has_chi_square:
             return
         for e, schedule in enumerate(fitted.schedules):

@@ -43,6 +43,7 @@ def _list_exchanges(schedule: Schedule, library: Library) -> Iterator[Schedule]:
     for i, (one, other) in enumerate(pairwise(schedule.sequence)):
         sequence = (*schedule.sequence[:i], other, one, *schedule.sequence[i + 2 :])
         moved, knots = schedule.times.copy(), schedule.knots
+        # The two modes with their durations exchanged as well.
         moved[i] = knots[i] + knots[i + 2] - knots[i + 1]
         for times in (moved, schedule.times):
             changed = merge_neighbours(schedule.replace(sequence, times))
@@ -85,6 +86,7 @@ def _fit_neighbours(improver: Improver, best: Fitted) -> dict[tuple[int, str], M
             note = ModeWarning("no trace", mode, name, begin, end, unit=unit)
             untraced[e, mode] = max(untraced.get((e, mode), note), note, key=lambda each: each.end - each.begin)
     for cost, given in improver.choose_lowest(best, every):
+        # A sequence that is in the pool with a lower J has been fitted from a better place.
         if cost < known.get(tuple(each.sequence for each in given), np.inf):
             if several and improver.is_ruled_out(best, given):
                 continue

@@ -59,6 +59,7 @@ def measure_worth(estimate: Estimate) -> float:
     estimate : Estimate
     """
     channels = estimate.residuals.channels
+    # Only channels whose correlation is beyond doubt: an estimate of r is never exactly 0.
     found = [c.effective / len(c.values) for c in channels if c.whiteness * len(channels) < UNEXPLAINED]
     return min(found, default=1.0)
 

@@ -61,10 +61,12 @@ def list_pulses(
     theta = np.concatenate([*(schedule.times for schedule in schedules), parameters])
     found: list[tuple[float, list[Schedule]]] = []
     for e, rate in enumerate(compute_rates(fitter.get_evaluator(schedules), theta)):
+        # `splice` takes modes that last; a fit may end with some that do not.
         schedule = drop_empty(schedules[e])
         for pulse in rate.minima(MINIMA_OF_EACH_MODE):
             for begin, length in _place_pulse(schedule, pulse.time):
                 changed = splice(schedule, pulse.mode, begin, begin + length)
+                # A pulse between two modes may make a succession that the library does not have.
                 moved = spread(changed, library) if library.admits(changed.sequence) else None
                 if moved is not None and moved.switches > schedule.switches:  # to move a transition is the fit's task
                     found.append((pulse.rate * length, [*schedules[:e], moved, *schedules[e + 1 :]]))
@@ -77,6 +79,7 @@ def _place_pulse(schedule: Schedule, time: float) -> list[tuple[float, float]]:
     """
     knots = schedule.knots
     i = min(int(np.searchsorted(schedule.times, time, "right")), schedule.switches)
+    # A pulse that takes all of a mode replaces it, which is a move of another kind.
     room = (1 - LEAST_PART_LEFT) * (knots[i + 1] - knots[i])
     lengths = {min(part * (schedule.tf - schedule.t0), room) for part in PULSE_LENGTHS}
     return [(min(time, float(knots[i + 1]) - length), length) for length in sorted(lengths) if length > 0.0]
@@ -104,9 +107,13 @@ def insert_modes(improver: Improver, schedules: Sequence[Schedule], parameters: 
         show_detail(f"{current.switches} switches", current.cost)
         lowest = min(map(weigh, pool), default=np.inf)
         _insert_and_fit(improver, current)
+        # To the last bit: `Fitter.fit` hands out the same fit for the same start, so that a schedule which was visited
+        # comes back as it was.
         candidates = [each for each in pool.by_switches.values() if each.theta.tobytes() not in visited]
         if not candidates:
             break
+        # The best that was not looked at yet, even where it is no better: from there two pulses may pay where one does
+        # not.
         current = min(candidates, key=weigh)
         waited = 0 if is_lower(min(map(weigh, pool)), lowest) else waited + 1
 
@@ -114,6 +121,7 @@ def insert_modes(improver: Improver, schedules: Sequence[Schedule], parameters: 
 def _insert_and_fit(improver: Improver, current: Fitted) -> None:
     """Fit with one pulse more, and the lowest of these ends without each of its modes."""
     given = list_pulses(improver.fitter, current.schedules, current.parameters)[:FITTED_PULSES]
+    # The rate is a derivative at no length; which pulse pays shows after the fit alone.
     ends = [improver.polish(each, current.parameters, "insertion") for _, each in given]
     for end in sorted(ends, key=lambda each: each.cost)[:REMOVED_FROM]:
         for e, schedule in enumerate(end.schedules):

@@ -130,6 +130,7 @@ class Insertion(Printed):
         for mode, rate in zip(self.modes, self.rate.T, strict=True):
             known = np.where(np.isfinite(rate), rate, np.inf)
             before, after = np.append(np.inf, known[:-1]), np.append(known[1:], np.inf)
+            # Of a plateau the last place counts, once.
             places = np.flatnonzero((known < 0.0) & (known <= before) & (known < after))
             lowest = places[np.argsort(known[places], kind="stable")][:count]
             found += [Pulse(mode, float(self.times[r]), float(known[r])) for r in lowest.tolist()]
@@ -229,6 +230,7 @@ def add_all_modes(problem: Problem) -> Problem:
 def compute_rates(evaluator: Evaluator, theta: FloatArray) -> tuple[Insertion, ...]:
     """Return the insertion rates of each experiment at theta (d,); the problem must have `max_transitions`."""
     problem = evaluator.problem
+    # At a minimum these are the optimiser's; elsewhere the nearest that there are.
     multipliers = np.split(_estimate_multipliers(evaluator, theta), np.cumsum(problem.constraint_counts)[:-1])
     trajectories, _ = compare(evaluator, theta)
     found = []

@@ -213,6 +213,7 @@ class ModeSearch(SearchRecord, Displayed):
 
     def _estimate(self, fit: ModeFit) -> Estimate:
         """Return the estimate of a sequence, computed at the first access."""
+        # The best is certified already, and a file without its model has that one alone.
         if self.best is not None and self.chosen and fit.sequences == self.chosen[0].sequences:
             return self.best
         return self._certifier.estimate(self._restore(fit))
@@ -230,6 +231,7 @@ class ModeSearch(SearchRecord, Displayed):
                 "This search was loaded without its model, and its file has the estimate of the best sequence "
                 "alone: load it with ModeSearch.load(path, problem=problem)."
             )
+        # No restrictions are needed any more: sequences that were fitted are admitted by what the search was told.
         followers = {mode: tuple(other for other in self.modes if other != mode) for mode in self.modes}
         durations = dict(zip(self.modes, self.durations, strict=True))
         library = Library(self.modes, self.modes, self.modes, followers, durations, self.max_switches)
@@ -294,6 +296,7 @@ class ModeSearch(SearchRecord, Displayed):
         rows = np.arange(len(times))
         for fit in self.chosen:
             sequence = [self.modes.index(mode) for mode in fit.sequences[e]]
+            # At a transition time the mode after it counts.
             found[rows, np.take(sequence, np.searchsorted(fit.transition_times[e], times, "right"))] += fit.weight
         return found
 
@@ -336,6 +339,7 @@ class ModeSearch(SearchRecord, Displayed):
         file = as_path(path, "path")
         content: dict[str, Any] = {"format": SEARCH_FORMAT, "version": SEARCH_VERSION, "message": self.message}
         content["search"] = to_json(self, SearchRecord)
+        # By its name: the sentence that is an enum's value may be worded anew, and files must stay readable.
         content["search"]["ending"]["status"] = self.status.name
         content["best"] = None if self.best is None else describe_best(self.best)
         write_document(content, file)
@@ -386,12 +390,14 @@ class ModeSearch(SearchRecord, Displayed):
             if best is not None:
                 found = cls(**own, problem=problem)
                 chosen = found._restore(found._require_best())
+                # With its problem the estimate has profiles and predictions again.
                 best = replace(best, problem=found._certifier.build_problem(chosen))
         return cls(**own, best=best, problem=problem)
 
 
 def _check_problem(record: SearchRecord, problem: Problem, path: Path) -> None:
     """Raise ValueError unless a search that was loaded from a file may be that of a problem."""
+    # Names and horizons alone: a file has no digest of the model and its data.
     runs, modes, ends = problem.experiments, problem.system.modes, list(zip(record.starts, record.ends, strict=True))
     same_runs = name_runs(runs) == record.run_names and [(run.t0, run.end) for run in runs] == ends
     if not (same_runs and set(record.modes) <= set(modes)):

@@ -60,6 +60,7 @@ class Schedule(NamedTuple):
 
 def merge_neighbours(schedule: Schedule) -> Schedule:
     """Return the schedule without transitions from a mode to itself."""
+    # Transition i leads from mode i to mode i + 1.
     keep = [i for i in range(schedule.switches) if schedule.sequence[i] != schedule.sequence[i + 1]]
     sequence = (schedule.sequence[0], *(schedule.sequence[i + 1] for i in keep))
     return schedule.replace(sequence, schedule.times[keep])
@@ -70,6 +71,7 @@ def remove_segments(schedule: Schedule, i: int, count: int = 1) -> Schedule:
     ones become one.
     """
     knots, j = schedule.knots, i + count
+    # Without the first mode or the last there is no neighbour to meet: the other one takes all.
     inside = [0.5 * (knots[i] + knots[j])] if i > 0 and j <= schedule.switches else []
     left = np.concatenate([schedule.times[: max(i - 1, 0)], inside, schedule.times[j:]])
     return merge_neighbours(schedule.replace((*schedule.sequence[:i], *schedule.sequence[j:]), left))
@@ -82,6 +84,7 @@ def collapse(schedule: Schedule, library: Library, shortest: float) -> Schedule:
     """
     schedule = merge_neighbours(schedule)
     durations = schedule.durations
+    # One at a time, shortest first: its neighbours become longer, and may then stay.
     for i in np.argsort(durations, kind="stable").tolist() if schedule.switches else []:
         without = remove_segments(schedule, i)
         if durations[i] <= shortest and library.admits(without.sequence):
@@ -94,16 +97,20 @@ def splice(schedule: Schedule, mode: str, begin: float, end: float) -> Schedule:
     horizon, whatever was active there.
     """
     names, starts = schedule.sequence, [schedule.t0, *schedule.times.tolist()]
+    # Lists and bisect in place of arrays: `list_insertions` splices for every pair of times of a grid and every mode.
     i = bisect_left(starts, begin)  # modes that begin before
     j = bisect_right(starts, end) - 1 if end < schedule.tf else len(names)  # the mode that is active after
+    # Where a neighbour has the same mode already, the pulse lengthens it and there is no transition.
     opens, closes = not i or names[i - 1] != mode, j < len(names) and names[j] != mode
     sequence = (*names[:i], *[mode] * opens, *names[j if closes else j + 1 :])
+    # Beginnings of all modes, of which the first is t0 and no transition.
     times = [*starts[:i], *[begin] * opens, *[end] * closes, *starts[j + 1 :]][1:]
     return schedule.replace(sequence, np.array(times))
 
 
 def drop_empty(schedule: Schedule) -> Schedule:
     """Return the schedule without modes of no duration."""
+    # Each mode that lasts begins at its own knot; equal neighbours of one that went become one.
     there = np.flatnonzero(schedule.durations > 0).tolist()
     sequence = tuple(schedule.sequence[i] for i in there)
     return merge_neighbours(schedule.replace(sequence, schedule.knots[there[1:]]))
@@ -115,6 +122,7 @@ def list_removals(schedule: Schedule, library: Library) -> Iterator[Schedule]:
     admitted = [library.admits(without.sequence) for without in alone]
     yield from (without for without, is_admitted in zip(alone, admitted, strict=True) if is_admitted)
     for i in range(schedule.switches):
+        # Where A, B, C, A is the only succession, neither B nor C may go alone, but both together may.
         if schedule.switches > 1 and not (admitted[i] or admitted[i + 1]):
             without = remove_segments(schedule, i, 2)
             if library.admits(without.sequence):
@@ -144,10 +152,12 @@ def list_insertions(schedule: Schedule, library: Library, cells: int = CELLS) ->
     """
     grid = np.linspace(schedule.t0, schedule.tf, cells + 1)
     times = np.unique(np.concatenate([grid, schedule.times])).tolist()
+    # `admits` is asked for the same sequences again and again: they are few, the pairs of times many.
     whole, close, admits = drop_empty(schedule), 1e-12 * (schedule.tf - schedule.t0), cache(library.admits)
     for begin, end in combinations(times, 2):
         for mode in library.modes:
             changed = splice(whole, mode, begin, end)
+            # A mode put where it is active already gives the schedule back.
             is_other = changed.sequence != schedule.sequence or np.any(np.abs(changed.times - schedule.times) > close)
             if is_other and admits(changed.sequence):
                 yield changed
@@ -164,6 +174,7 @@ def spread(schedule: Schedule, library: Library, room: float = 1e-9) -> Schedule
         Shortest duration, as a part of the horizon, also where modes may have none.
     """
     length = schedule.tf - schedule.t0
+    # A little more than must be: rounding of the sum of durations shall not make a feasible start infeasible.
     least = np.array([library.durations[mode] for mode in schedule.sequence]) * (1 + 1e-9) + room * length
     if least.sum() >= length:
         return None

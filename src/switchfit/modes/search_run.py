@@ -195,11 +195,13 @@ class SearchRun:
             self._search_from(start, self.settings.width)
             if given is None and self.pool.is_explained():
                 break
+        # No generator has led anywhere: at least there is a fit whose message says why.
         if self.pool.best is None:
             self._fit_given()
 
     def _widen(self) -> None:
         """Search from more starts, with more hypotheses."""
+        # The first of the drawn ones is the guess, from which the search has begun already.
         starts = list(
             draw_starts(self.fitter.problem, 1 + MOST_RANDOM_STARTS, self.settings.seed)[1:, self.fitter.first :]
         )
@@ -280,6 +282,7 @@ class SearchRun:
             warnings = (ModeWarning(fault, samples=count_outliers(found.best)), *warnings)
         else:
             ratio = float(np.sqrt(estimate.residual_variance))
+            # A sigma that fits the residuals explains them by construction: that is no proof of the sequence.
             ending = replace(ending, status=ModeStatus.NOT_EXPLAINED, reason=fault, ratio=ratio)
         fits, evaluations = self.fitter.fits + found.fits, self.fitter.evaluations + found.evaluations
         return replace(found, warnings=warnings, ending=ending, fits=fits, evaluations=evaluations)

@@ -123,6 +123,7 @@ def calibrate(
         raise ValueError(f"correlation must be at least 0 and below 1; got {phi}.")
     problem = _build_quiet_problem(online, length)
     theta = problem.initial_theta
+    # One trajectory for all runs: it has no changes, and noise enters its samples alone.
     comparisons = compare(Evaluator(problem, theta), theta)[1][0]
     trial = online._build_like(problem, NEVER)
     rng, maxima = np.random.default_rng(seed), []
@@ -132,17 +133,21 @@ def calibrate(
         for item, comparison in zip(problem.experiments[0].data, comparisons, strict=True):
             noise = rng.standard_normal(comparison.fitted.shape)
             for k in range(1, len(noise)):
+                # First-order autoregressive, with variance 1 at every sample.
                 noise[k] = phi * noise[k - 1] + np.sqrt(1 - phi**2) * noise[k]
             noisy.append((item.times, comparison.fitted + item.sigma * noise))
         largest = 0.0
         for t, y in list_updates(noisy):
             now = trial.update(t, y)
+            # As long as there are fewer values than unknowns, a statistic means nothing, and nothing is declared.
             if now.status is not OnlineStatus.WAITING:
                 largest = max(largest, now.statistic)
         maxima.append(largest)
     found = np.array(maxima)
     middle = float(np.median(found))
+    # s of the docstring: the mean excess over the median, by `EXCESS`. 0 where no run exceeds it.
     tail = float((found[found > middle] - middle).mean()) / EXCESS if (found > middle).any() else 0.0
+    # log(2) / length exp(-(h - m) / s) = rate, solved for h; never below the median, where the tail is not exponential.
     threshold = middle + tail * max(np.log(np.log(2)) - np.log(length) - np.log(rate), 0.0)
     return Calibration(threshold, rate, length, found)
 
@@ -154,6 +159,7 @@ def _build_quiet_problem(online: Any, length: float) -> Problem:
     t0 = run.t0 if now is None else now.time
     data = []
     for item in run.data:
+        # By the problem's own times if it has some, else by what the samples so far have shown.
         gap = float(np.median(np.diff(item.times))) if len(item.times) > 1 else online.spacing
         if gap is None:
             raise ValueError(
@@ -168,6 +174,7 @@ def _build_quiet_problem(online: Any, length: float) -> Problem:
         changes["inputs"] = hold_inputs(run.inputs, np.array([t0]), online.held[None])
     parameters = problem.parameters
     if now is not None:
+        # False alarms where the system is now: their rate depends on the mode, its state and its parameters.
         changes |= {"mode_sequence": (now.mode,), "initial_state": now.state}
         parameters = {name: replace(each, value=now.parameters[name]) for name, each in parameters.items()}
     quiet = replace(run, data=tuple(data), transition_times=(), t0=t0, tf=t0 + length, **changes)

@@ -634,6 +634,7 @@ class OnlineEstimator:
             b = exact
         own, count = kept.take(slice(b, b + 1)), int(kept.switches[b])
         modes, times = own.modes[0, : count + 1], tracker.times(own, found.moved[b : b + 1])[0, :count]
+        # Before `_declare` and `_renew`, which move the window's start and change the hypotheses.
         best = self._describe(count, found, b)
         walked = self._measure_walks(best) if self._walks.any() else 0.0
         past = tuple(tracker.left)
@@ -676,6 +677,7 @@ class OnlineEstimator:
         common = int(np.minimum.accumulate(declared[: len(modes)] == modes[: len(declared)]).sum())
         count = len(declared) - common
         retracted = self._alarms[-count] if 0 < count <= len(self._alarms) else None
+        # Alarms of changes that the new sequence does not have.
         if count:
             del self._alarms[-count:]
         self._tracker.declared = modes.copy()
@@ -686,6 +688,8 @@ class OnlineEstimator:
         else:  # another mode than was declared since what left the window
             _, time, error = self._tracker.left[-1]
         alarm = Alarm(t, self._beam.modes[modes[-1]], time, error, statistic)
+        # Two changes at once are one alarm, which stands in the list for each of them: a later retraction counts
+        # changes.
         self._alarms += [alarm] * (len(modes) - common)  # it declares so many changes
         return alarm, retracted
 

@@ -53,6 +53,7 @@ class Feed:
 
     def find(self, time: float) -> int:
         """Return the last node that is not later than a time; -1 if all are."""
+        # The usual case, a sample that is the newest, needs no search.
         if time >= self._nodes[self.count - 1]:
             return self.count - 1
         return int(self.nodes.searchsorted(time, "right")) - 1
@@ -65,10 +66,14 @@ class Feed:
         if end > self.capacity:
             raise ValueError(f"there is no room for more than {self.capacity} times: raise capacity=, or set window=.")
         if node < end:
+            # Copies, since source and target overlap; this is the rare case of a late sample.
             self._nodes[node + 1 : end + 1] = self._nodes[node:end].copy()
             self.signals[node:end] = self.signals[node - 1 : end - 1].copy()
+            # A cell that is cut keeps its cubic on the left; on the right it counts from the new node.
             self.signals[node] = shift_cubic(self.signals[node - 1], time - self._nodes[node - 1])
         self._nodes[node] = time
+        # `first[j]` is the number of samples before node j: the new node has none yet, and all behind it move by one
+        # place.
         for first, *_ in self._samples:
             first[node + 1 : end + 2] = first[node : end + 1].copy()
         self.count += 1
@@ -80,10 +85,12 @@ class Feed:
         place, end = first[node + 1], first[self.count]
         if end == self.capacity:
             raise ValueError(f"there is no room for more than {end} samples: raise capacity=, or set window=.")
+        # Samples stand in the order of their nodes, as machine code walks through them.
         if place < end:
             for array in (times, values, weights):
                 array[place + 1 : end + 1] = array[place:end].copy()
         times[place], values[place], weights[place] = self._nodes[node], value, weight
+        # A running count: all nodes behind have one sample more before them.
         first[node + 1 : self.count + 1] += 1
 
     def has_sample(self, k: int, node: int) -> bool:
@@ -98,6 +105,7 @@ class Feed:
         self.signals[: end - 1 - node] = self.signals[node : end - 1].copy()
         self.count -= node
         for first, *arrays in self._samples:
+            # Samples at the node itself are in the start of the window, which counts them.
             gone, last = first[node + 1], first[end]
             for array in arrays:
                 array[: last - gone] = array[gone:last].copy()

@@ -54,6 +54,7 @@ def build_kept_problem(
             START_STATE_PARAMETER: len(arrival.gradient) - len(arrival.moved),
             INITIAL_STATE_PARAMETER: int((states >= 0).sum()),
         }
+        # The priors are in the arrival cost.
         parameters = {name: replace(parameter, prior=None) for name, parameter in parameters.items()}
         parameters |= {name: Parameter(np.zeros(size)) for name, size in known.items() if size}
     elif (states >= 0).any():
@@ -75,6 +76,7 @@ def _describe_arrival(problem: Problem, arrival: Start, t0: float) -> tuple[Any,
     """
     unknowns, run = problem.unknowns, problem.experiments[0]
     values, vectors = np.linalg.eigh(arrival.matrix)
+    # Directions without knowledge have no row in R; a root of their rounding would measure them.
     there = values > LEAST_RELATIVE_CURVATURE * values[-1]
     R = (vectors[:, there] * np.sqrt(values[there])).T
     s = (vectors[:, there] / np.sqrt(values[there])).T @ arrival.gradient

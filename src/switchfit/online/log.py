@@ -102,8 +102,10 @@ class OnlineLog(Printed):
         (1,)
         """
         true = as_array(truth, "truth").reshape(-1)
+        # A false alarm that was retracted is no detection, however early it came.
         kept = [alarm for alarm in self.alarms if alarm not in self.retracted]
         found = []
+        # An alarm belongs to the last true change before it; one before the first is false.
         for begin, end in zip(true, np.append(true, np.inf)[1:], strict=True):
             own = [alarm.time - begin for alarm in kept if begin <= alarm.time < end]
             found.append(min(own, default=np.nan))
@@ -212,6 +214,7 @@ def replay(
     [('off', 2.5)]
     """
     online = OnlineEstimator(problem, **settings)
+    # The model's own sensors say how values are observed; other data replace their numbers alone.
     own = problem.experiments[0].data
     given = as_instances(own if data is None else data, "data", Measurements, "sf.Measurements")
     if len(given) != len(own):

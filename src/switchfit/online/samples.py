@@ -25,6 +25,7 @@ def read_sigma(item: Measurements) -> FloatArray:
     """Return sigma of each channel, (q,): that of its first value, if it has one for each."""
     if item.sigma.ndim < 2:
         return np.broadcast_to(item.sigma, item.values.shape[1:])
+    # One for each channel, of the first sample in which that is not missing.
     return np.asarray(np.diagonal(item.sigma[(~np.isnan(item.values)).argmax(0)]))
 
 

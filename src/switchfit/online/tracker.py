@@ -154,6 +154,8 @@ class Tracker:
     def _catch_up(self, there: Kept) -> Kept:
         """Let the entries e of hypotheses begin where the window does now."""
         if there.shift is not self.shift:
+            # The start moves with every update, while hypotheses of earlier nodes are needed only where a sample comes
+            # late: what they have missed is added then.
             there.found.moved[:, : len(self.shift)] += self.shift - there.shift
         return there._replace(shift=self.shift)
 
@@ -171,15 +173,18 @@ class Tracker:
         which of those that have more after it: none in which a mode would last less than no time, unless declared.
         """
         last = len(self.declared) - 1
+        # Of sequences that begin as was declared; `exact` has no change after it, `further` one or more.
         same = (kept.modes[:, : last + 1] == self.declared).all(1)
         exact = (same & (kept.switches == last)).nonzero()[0]
         others = value.argsort().tolist()  # those that have failed come last
+        # Where no hypothesis has its times in order, the lowest one still has to say something.
         best = next((b for b in others if self._is_ordered(kept, found, b)), others[0])
         further = (same & (kept.switches > last)).tolist()
         more = (b for b in others if further[b] and self._is_ordered(kept, found, b))
         if not len(exact):
             return best, None, next(more, None)
         own = int(exact[value[exact].argmin()])
+        # What was declared counts even with times out of order: its cost alone retracts an alarm.
         return own if value[own] < value[best] else best, own, next(more, None)
 
     def _is_ordered(self, kept: Sequences, found: Hypotheses, b: int) -> bool:
@@ -210,6 +215,7 @@ class Tracker:
         node = self.node + 1
         if node == 0:
             kept = Sequences.start(rules.first, S, float(self.feed.nodes[0]))
+            # At node 0 there is nothing but priors; the engine gets its tolerances and limits here.
             start = self._pass.build_start(np.zeros((1, beam.births + len(beam.places))))
             found = beam.engine.begin(self._parameters, start, beam.tolerances, self._build_limits())
             self.kept.append(self._keep(kept, found.records))
@@ -225,6 +231,7 @@ class Tracker:
         table[B:, Column.SLOT] += A
         found = beam.engine.advance(found, table, node - 1, node)
         chosen = self._select(self.value(children.switches, found), children.code, children.switches)
+        # No finite score in any mode: the state, or its derivative, is not finite.
         if not len(chosen):
             raise StoppedError(t)
         self.kept.append(self._keep(kept.follow(children, chosen, t), found.records[chosen]))
@@ -235,6 +242,8 @@ class Tracker:
         chosen = select_lowest(value, code, switches, self.settings.width, MOST_OF_ONE_SEQUENCE)
         # What was declared, and where there are more modes in the window, that without the last one or two.
         modes = [*(each.mode for each in self.left), *self.declared.tolist()]
+        # A change cannot be refuted by hypotheses that were dropped: what was declared, and without its last changes,
+        # goes on however bad it looks for a moment.
         there = code[chosen].tolist()  # if any of a sequence, then its best
         for own in [encode(modes), encode(modes[:-1]), encode(modes[:-2])][: len(self.declared)]:
             if own not in there:
@@ -245,6 +254,7 @@ class Tracker:
     def _build_limits(self) -> HypothesisLimits:
         """Return how far times and parameters may move; what is before the window may move anywhere."""
         low, high, most = self._pass.build_limits()
+        # A birth at each node: its time moves by up to one spacing, beyond which another node's birth is responsible.
         reach = np.full(self.beam.births, self.spacing)
         reach[: self.settings.entries] = np.inf
         for values, sign in ((low, -1.0), (high, 1.0), (most, 1.0)):
@@ -267,6 +277,7 @@ class Tracker:
         # Births are where they have moved; the entries e and the parameters stay moved, and the start follows them.
         moved[:, A : A + S] = 0.0
         # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
+        # Until something has left, the start is t0 with its priors, as of a beam along a log.
         begun = self._pass.build_start(moved) if start is None else start.build(moved, self._artificial)
         first = None if start is None else self.first
         return self._pass.propagate(begun, kept, births, times, last, first, recentres=recentres)
@@ -274,10 +285,13 @@ class Tracker:
     def polish(self) -> None:
         """Propagate the hypotheses that decide anew, from where they have moved."""
         last = self.node
+        # The window has no stretch to be propagated over.
         if last <= self.first:
             return
         kept, found = self.latest
         value = self.value(kept.switches, found)
+        # Three at most, and two more below: to propagate all of them over the window would take longer than the update
+        # itself.
         best = {b for b in self.find_best(kept, found, value) if b is not None}
         # A change can be refuted only where the modes before it fit as well as they can.
         doubted = 2.0 * (value - value.min()) < REFUTED_FROM
@@ -291,6 +305,7 @@ class Tracker:
         anew = self._propagate(own, moved, times, own.switches, last, recentres=True)
         good = np.isfinite(anew.scores)
         chosen = chosen[good]
+        # In place, so that later nodes go on from there. One that failed keeps what it was.
         found.records[chosen] = anew.records[good]
         kept.times[chosen], kept.last[chosen] = times[good], latest[good]
 
@@ -305,11 +320,14 @@ class Tracker:
         own, moved = kept.take(slice(b, b + 1)), found.moved[b : b + 1].copy()
         end = float(feed.nodes[following])
         times, _ = self._place_births(own, moved, np.inf)
+        # Transitions of the best hypothesis before the new start; those of others that differ are dropped by `_follow`.
         gone = sum(time < end for time in times[0, : own.switches[0]].tolist())
         # The best hypothesis alone says what was before the new start: x, Z, J, g and H at the node, without moving on.
         there = self._propagate(own, moved, times, gone, following, recentres=False)
+        # The error that is reported for good once the transition has left: without H_0, which is no knowledge.
         known = drop_artificial(found.matrices[b], self.artificial)
         errors = np.sqrt(np.diag(invert(known)))[A : A + gone] if gone else np.zeros(0)
+        # The new start is the point of linearisation of times and e; parameters keep where they have moved.
         there.moved[:, : A + S] = 0.0
         pasts = []
         # Transitions that are behind the new start become entries e, one after the other; for each one combination of n
@@ -322,14 +340,18 @@ class Tracker:
         self.start = Start(there.moved[0].copy(), float(there.costs[0]), g, H, x, Z)
         modes = own.modes[0, : gone + 1]
         self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
+        # e counts from the new x_w, to which the best hypothesis' own e has moved.
         self.shift = self.shift - moved[0, :A]
         # Without a transition, hypotheses of earlier nodes that disagree are dropped once they have come to the last.
+        # With a transition that leaves, the arrays of every kept node must change their slots; without one they may
+        # wait.
         count, followed = (self.node - following + 1 if pasts else 1), deque[Kept](maxlen=KEPT_NODES)
         while self.kept and len(followed) < count:
             agreeing = self._follow(self.kept.pop(), pasts, modes, times[0, :gone], end)
             if agreeing is None:
                 break
             followed.appendleft(agreeing)
+        # What is before a node without an agreeing hypothesis is lost: a sample that comes so late takes `repeat`.
         self.kept = followed if pasts else self.kept + followed
         self.first = following
         if gone:
@@ -350,6 +372,8 @@ class Tracker:
         A, k = self.settings.entries, len(pasts)
         there = self._catch_up(there)
         kept, found, _ = there
+        # No birth that could lie before the start: all agree, and nothing is copied. This is the usual case of an
+        # update.
         is_early = kept.times[:, 0] + found.moved[:, A] < end
         if not pasts and not kept.switches[is_early].any():
             return there
@@ -369,6 +393,8 @@ class Tracker:
         for past in pasts:
             past.absorb(found, self.birth_information)
         if k:
+            # The first k modes and times have left, the slots at the end are free; codes of sequences stay, with what
+            # has left.
             rolled = np.roll(kept.modes, -k, axis=1), np.roll(kept.times, -k, axis=1)
             for array in rolled:
                 array[:, -k:] = 0
@@ -392,6 +418,7 @@ class Tracker:
         self.start.gradient[new] += begun.gradients[0, new]
         self.start.matrix[new, new] += (np.diag(begun.matrices[0]) - self.artificial)[new]
         kept, found = self.latest
+        # Each hypothesis' own e and old parameters, in the new entries.
         found.moved[:, :A] = np.hstack([found.moved[:, :A], found.moved[:, chosen] - center[chosen]]) @ turn
         self.repeat(kept, found)
 
@@ -405,6 +432,7 @@ class Tracker:
         good = np.flatnonzero(np.isfinite(anew.scores))
         if not len(good):
             raise StoppedError(float(self.feed.nodes[self.first]))
+        # Hypotheses of earlier nodes are not those of the new values: a late sample goes back no further than this.
         self.kept.clear()
         self.kept.append(self._keep(kept._replace(times=times, last=latest).take(good), anew.records[good]))
         self.node = last
@@ -414,6 +442,7 @@ class Tracker:
         when each sequence began its last mode, (B,).
         """
         A, begin = self.settings.entries, float(self.feed.nodes[self.first])
+        # A birth at the last node itself has had no sample yet, and its derivative would be zero.
         before, times, last = nextafter(end, begin), np.zeros(kept.times.shape), kept.last.copy()
         free = (kept.times + moved[:, A : A + self.settings.births]).tolist()
         for b, count in enumerate(kept.switches.tolist()):  # of few: fast without arrays
@@ -434,6 +463,7 @@ class Tracker:
         """Return all arrays, and other numbers, as a file."""
         arrays: dict[str, Any] = {f"feed {name}": array for name, array in self.feed.copy_arrays().items()}
         for k, (sequences, found, shift) in enumerate(self.kept):
+            # Records are the engine's memory as it stands: the same program goes on from them, bit for bit.
             own = sequences._asdict() | {"records": found.records, "shift": shift}
             arrays |= {f"kept {k} {name}": array for name, array in own.items()}
         arrays |= {"shift": self.shift, "declared": self.declared}

@@ -73,7 +73,10 @@ def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: Floa
     """
     D, m = len(start.gradient), len(chosen)
     old, new = np.concatenate([np.arange(entries), chosen]), np.arange(D, D + m)
+    # Unknowns in the order e_old, tau, p; new values of the chosen ones are appended behind D until `into` puts them in
+    # their places.
     others = np.setdiff1d(np.arange(D), old)
+    # An infinite variance adds zeros: the new value begins without knowledge.
     H, g = np.zeros((D + m, D + m)), np.append(start.gradient, np.zeros(m))
     H[:D, :D] = start.matrix
     for pair, variance in zip(zip(chosen, new, strict=True), variances, strict=True):
@@ -82,6 +85,7 @@ def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: Floa
     # x = x_w + Z_old (e, p_old): the right singular vectors split these into combinations that move the state, the new
     # e, and those that do not.
     _, sizes, V = np.linalg.svd(start.tangent[:, old])
+    # At most n combinations move n entries of the state, which is why A = n entries suffice for any past.
     rank = int(np.count_nonzero(sizes > LEAST_RELATIVE_SINGULAR_VALUE * sizes[0]))
     turn, idle = V[:rank].T, V[rank:].T
     # The unknowns in their new places, then the combinations without effect, which are eliminated.
@@ -118,11 +122,13 @@ class Past(NamedTuple):
     @classmethod
     def of(cls, tangent: FloatArray, entries: int, births: int) -> Past:
         """Return it for a tangent (n, D) at the start of the window."""
+        # Right singular vectors of (n, n + 1): the last one is the null space, whatever the rank.
         return cls(np.linalg.svd(tangent[:, : entries + 1])[2].T, births)
 
     def turn(self, values: FloatArray) -> FloatArray:
         """Return values (..., D) along the unknowns in the new ones; the one without effect becomes the last time."""
         A = len(self.rotation) - 1
+        # From (e, tau_1 | tau_2 ... | p) to (e' | tau_2 ... , tau without effect | p): slots move up by one.
         first, rest, p = np.split(values, [A + 1, A + self.births], axis=-1)
         turned = first @ self.rotation
         return np.concatenate([turned[..., :A], rest, turned[..., A:], p], axis=-1)
@@ -144,6 +150,8 @@ class Past(NamedTuple):
         lost = np.zeros(H.shape[1])
         lost[A] = prior
         reduced = H - np.diag(lost)
+        # Without H_0 the block may be singular, as right after a birth that no sample has seen: its Schur complement
+        # would divide by rounding.
         certain = np.linalg.eigvalsh(reduced[:, : A + 1, : A + 1])[:, 0] > 1e-9 * prior
         H = np.where(certain[:, None, None], reduced, H)
         H = self.turn(self.turn(H).swapaxes(1, 2))
