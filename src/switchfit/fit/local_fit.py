@@ -17,8 +17,11 @@ from numpy.typing import ArrayLike
 from switchfit.arrays import FloatArray
 from switchfit.fit.ending import describe_ending, find_undefined_function
 from switchfit.fit.insignificance import drop_noise_of_times, is_within_error
+from switchfit.fit.layout import layout_of
 from switchfit.fit.minimization import minimize_cost
-from switchfit.fit.solved_fit import SolvedFit, describe_problem, describe_solution
+from switchfit.fit.result import build_fit
+from switchfit.fit.search_record import SearchRecord
+from switchfit.fit.solved_fit import SolvedFit, describe_solution
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.meshes.follower import Follower
 from switchfit.meshes.halving import choose_next_meshes
@@ -118,21 +121,17 @@ def fit_on_meshes(
     ended = describe_ending(evaluator, result, earlier, error)
     if undefined := find_undefined_function(*(broken or (evaluator, result))):
         ended = replace(ended, reason=undefined)
-    found = SolvedFit(
-        **vars(ended),
-        **describe_problem(problem),
-        **describe_solution(evaluator, result, hessian),
+    kind = "sharp" if follower.has_rough_hessian and hessian in ("auto", "exact") else hessian
+    solution = describe_solution(evaluator, result, kind, error, output)
+    search = SearchRecord(
         initial_theta=start,
+        initial_cost=history[0].cost if history else np.nan,
         history=tuple(history),
         evaluations=evaluations,
-        trajectories=(),
-        comparisons=(),
-        hessian_kind="sharp" if follower.has_rough_hessian and hessian in ("auto", "exact") else hessian,
-        integration_error=error,
-        integration_error_of=output,
         seconds=time.perf_counter() - began,
-        initial_cost=history[0].cost if history else np.nan,
     )
+    model = {"problem": evaluator.problem, "evaluator": evaluator}
+    found = build_fit(SolvedFit, ended, layout_of(problem), solution, search, trajectories=(), comparisons=(), **model)
     found.simulate_later(fine)
     return found
 

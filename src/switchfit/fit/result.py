@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,18 +19,20 @@ from switchfit.arrays import FloatArray
 from switchfit.engine.evaluation import Engine
 from switchfit.fit.comparison import Comparison
 from switchfit.fit.kink_variance import free_kinks
+from switchfit.fit.layout import Layout
 from switchfit.fit.scaled_hessian import inverse_on
-from switchfit.fit.search_record import Rival, Step
+from switchfit.fit.search_record import SearchRecord
 from switchfit.fit.statistics import interval, measure_quantile
 from switchfit.fit.termination import Termination
 from switchfit.fit.trajectory import Trajectory
-from switchfit.optimize import IterationRecord
 from switchfit.problem.validation.arrays import as_level
 
 if TYPE_CHECKING:  # a float or an array: what does arithmetic with both needs no cast
     Values = Mapping[str, Any]
 else:  # what files are read as
     Values = Mapping[str, FloatArray]
+
+FitKind = TypeVar("FitKind", bound="Fit")
 
 
 @dataclass(frozen=True)
@@ -64,147 +66,74 @@ class FittedTransition:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Fit(Termination):
-    """Result of an estimation; d unknowns in the order of `theta_names`.
+class Solution:
+    """The end of a fit in numbers.
 
     Attributes
     ----------
-    theta_names, theta_units : tuple of str
-    initial_theta, theta, lower, upper : (d,)
-    run_names : tuple of str, one per experiment
-        Its name, or run1, run2, ...
+    theta : (d,)
     transition_times : tuple of (N,) arrays, one per experiment, fixed ones included
-    transition_places : tuple of (N,) int arrays, one per experiment
-        Index in theta of each transition time; -1 if it is fixed.
-    final_places : tuple of int, one per experiment
-        Index in theta of its tf; -1 if it is fixed.
     parameters : dict of name -> float, or array where there are several, fixed ones included
-    parameter_units : dict of name -> str, fixed ones included
-    fixed : tuple of str
-        Names of the parameters that are fixed.
-    cost : float
     gradient, hessian : (d,), (d, d), exact at theta
-    optimality : float
-        KKT residual; the norm of the gradient if no constraint is active.
-    iterations, evaluations : int
-        Iterations of the fit that found theta; evaluations of everything that was tried.
-    status : Status
-    history : tuple of IterationRecord
-        Of the fit that found theta. Where strategies were tried, it begins where one of them ended.
-    active : tuple of ActiveConstraint
-        Bounds, and shortest durations of modes, that hold with equality.
-    kinks : tuple of Kink
-        Unknowns that ended where the derivative jumps through zero.
-    free_basis : (d, k)
-        Orthonormal basis of the directions that constraints and kinks leave free.
-    trajectories : tuple of Trajectory, one per experiment
-    comparisons : tuple of tuples of Comparison, one tuple per experiment
-    sigma_known : bool or None
-        Whether the noise of the measurements is known; None if the cost has no noise model.
-    integration_error : float
-        Largest relative change by halving all steps of J, the guards and the terminal constraints; see
-        `Certificate.integration_error`.
     hessian_kind : str
         The argument of `estimate`; "sharp" where the Gauss-Newton matrix took the place of an exact Hessian that was
         not accurate.
-    tolerance : float
-    seconds : float
-        Wall time of the estimation, always in seconds.
     constraints : tuple of (name, value, multiplier)
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
+    free_basis : (d, k)
+        Orthonormal basis of the directions that constraints and kinks leave free.
+    engine : Engine or None
+        Engine of cost and derivatives: machine code, or JAX with the reason. None if it is unknown.
+    integration_error : float
+        Largest relative change by halving all steps of J, the guards and the terminal constraints; see
+        `Certificate.integration_error`.
+    integration_error_of : str
+        The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
+    """
+
+    theta: FloatArray
+    transition_times: tuple[FloatArray, ...]
+    parameters: Values
+    gradient: FloatArray
+    hessian: FloatArray
+    hessian_kind: str
+    constraints: tuple[tuple[str, float, float], ...] = ()
+    free_basis: FloatArray
+    engine: Engine | None = None
+    integration_error: float
+    integration_error_of: str = "J"
+
+    def __post_init__(self) -> None:
+        plain = {name: float(v) if np.ndim(v) == 0 else np.asarray(v) for name, v in self.parameters.items()}
+        object.__setattr__(self, "parameters", plain)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(Termination, Layout, Solution, SearchRecord):
+    """Result of an estimation: the fields of its four records, and what follows from them.
+
+    How it ended (`Termination`), what its numbers stand for (`Layout`), these numbers (`Solution`), and how they were
+    found (`SearchRecord`). `dataclasses.replace` changes any field.
+
+    Attributes
+    ----------
+    trajectories : tuple of Trajectory, one per experiment
+    comparisons : tuple of tuples of Comparison, one tuple per experiment
     saved_gauss_newton : (d, d) or None
         The Gauss-Newton matrix of the samples, if it has been evaluated.
     saved_pieces : (T, 2, P, 5)
         Of transition times whose intervals follow from them, in a fit that was saved: as `Fits.pieces`.
     saved_piece_places : (T,) int
         Where in theta these transition times stand.
-    priors : dict of name -> str
-        The prior of each unknown that has one, in words.
-    log_scaled : tuple of str
-        Unknowns that were estimated on a logarithmic scale.
-    log_origins : (d,)
-        From where these logarithms count: t0 for a transition time, otherwise 0.
-    least_squares : bool
-        Whether the terms of measurements and priors in J are half a sum of squares: no sigma is a parameter, no loss is
-        robust.
-    engine : Engine or None
-        Engine of cost and derivatives: machine code, or JAX with the reason. None if it is unknown.
-    integration_error_of : str
-        The output that has the `integration_error`: "J", or the name of a guard or terminal constraint.
-    idle : tuple of str
-        Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of zero
-        duration between two intervals of the same mode, and parameters that act in collapsed modes alone. Their values
-        are arbitrary, and they are not in `free_basis`.
-    unread : tuple of str
-        Parameters that no function of the model reads: J does not depend on them.
-    absent : tuple of str
-        Parameters that are read only by modes, or at transitions, that do not occur in any mode_sequence.
-    earlier_iterations : int
-        Iterations before the last refinement of the mesh.
-    smallest_eigenvalue : float
-        Smallest eigenvalue of the Hessian on the free directions, each unknown scaled to unit curvature, as found by
-        the optimizer.
-    flat_direction : tuple of (str, float)
-        Unknowns with the largest components of its eigenvector, and these components.
-    violated : tuple of (str, float)
-        Guards and terminal constraints that are violated, and their values.
-    reason : Issue or None
-        Why the line search failed, or the error with which the fit ended.
-    starts : (tried, better, agreeing) or None
-        Numbers of other starts that were fitted, that ended lower than this fit, and that ended at its J; None without
-        other starts.
-    rivals : tuple of (unknown, value, rise)
-        Transition times of other minima that the data do not tell from this one, and by how much J is higher there.
-    steps : tuple of Step
-        The strategies that were tried, in order; empty if the first fit was enough.
-    initial_cost : float
-        J at `initial_theta`; NaN if it is unknown or cannot be evaluated there.
     """
 
-    theta_names: tuple[str, ...]
-    theta_units: tuple[str, ...]
-    initial_theta: FloatArray
-    theta: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-    run_names: tuple[str, ...]
-    transition_times: tuple[FloatArray, ...]
-    transition_places: tuple[NDArray[np.intp], ...]
-    final_places: tuple[int, ...]
-    parameters: Values
-    parameter_units: Mapping[str, str]
-    fixed: tuple[str, ...]
-    gradient: FloatArray
-    hessian: FloatArray
-    evaluations: int
-    history: tuple[IterationRecord, ...]
-    free_basis: FloatArray
     trajectories: tuple[Trajectory, ...]
     comparisons: tuple[tuple[Comparison, ...], ...]
-    sigma_known: bool | None
-    integration_error: float
-    hessian_kind: str
-    seconds: float
-    log_origins: FloatArray
-    constraints: tuple[tuple[str, float, float], ...] = ()
     saved_gauss_newton: FloatArray | None = None
     saved_pieces: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 1, 5)))
     saved_piece_places: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-    priors: Mapping[str, str] = field(default_factory=dict)
-    log_scaled: tuple[str, ...] = ()
-    least_squares: bool = True
-    engine: Engine | None = None
-    integration_error_of: str = "J"
-    starts: tuple[int, int, int] | None = None
-    rivals: tuple[Rival, ...] = ()
-    steps: tuple[Step, ...] = ()
-    initial_cost: float = np.nan
 
     __eq__, __hash__ = object.__eq__, object.__hash__
-
-    def __post_init__(self) -> None:
-        plain = {name: float(v) if np.ndim(v) == 0 else np.asarray(v) for name, v in self.parameters.items()}
-        object.__setattr__(self, "parameters", plain)
 
     @property
     def termination(self) -> Termination:
@@ -393,6 +322,24 @@ class Fit(Termination):
         log = np.isin(self.theta_names, self.log_scaled)
         low, high = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins).T
         return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
+
+
+def build_fit(
+    kind: type[FitKind], termination: Termination, layout: Layout, solution: Solution, search: SearchRecord, **own: Any
+) -> FitKind:
+    """Return a fit of a kind that is made of these records; `own`: the fields that are in none of them.
+
+    Parameters
+    ----------
+    kind : type
+        `Fit` or a subclass.
+    termination : Termination
+    layout : Layout
+    solution : Solution
+    search : SearchRecord
+    own
+    """
+    return kind(**vars(termination), **vars(layout), **vars(solution), **vars(search), **own)
 
 
 def invert(fit: Fit, matrix: FloatArray, scale: float) -> FloatArray:

@@ -12,11 +12,10 @@ from typing import Any, Self
 import numpy as np
 
 from switchfit.fit.comparison import compare
-from switchfit.fit.result import Fit
+from switchfit.fit.result import Fit, Solution
 from switchfit.meshes.evaluator import Evaluator
 from switchfit.optimize import Result
-from switchfit.optimize.minimization_problem import HessianKind
-from switchfit.problem.problem import Problem, keep_with_problem
+from switchfit.problem.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,46 +114,23 @@ class SolvedFit(Fit):
         return evaluator
 
 
-def describe_solution(evaluator: Evaluator, result: Result, hessian: HessianKind) -> dict[str, Any]:
-    """Return the fields of a fit at the solution: the exact Hessian even if the optimizer used another one.
+def describe_solution(evaluator: Evaluator, result: Result, kind: str, error: float, output: str) -> Solution:
+    """Return the numbers at the end: with the exact Hessian even if the optimizer used another one, of this kind.
 
     A model may be too sharp for an exact Hessian: see `Follower`.
     """
     times, parameters = evaluator.problem.split(result.theta)
-    is_other = hessian in ("gauss-newton", "none") and np.isfinite(result.cost)
-    return {
-        "theta": result.theta,
-        "transition_times": tuple(times),
-        "parameters": {name: np.array(value) for name, value in parameters.items()},
-        "gradient": result.gradient,
-        "hessian": evaluator(result.theta).hessian if is_other else result.hessian,
-        "constraints": result.equalities,
-        "free_basis": result.free_basis,
-        "engine": evaluator.engine,
-        "problem": evaluator.problem,
-        "evaluator": evaluator,
-    }
-
-
-@keep_with_problem
-def describe_problem(problem: Problem) -> dict[str, Any]:
-    """Return the fields of a fit that all fits of a problem share."""
-    unknowns, parameters = problem.unknowns, problem.parameters
-    counts = [len(run.transition_times) for run in problem.experiments]
-    times = list(zip(unknowns.times, counts, strict=True))
-    return {
-        "theta_names": unknowns.names,
-        "theta_units": unknowns.units,
-        "lower": unknowns.lower,
-        "upper": unknowns.upper,
-        "run_names": problem.run_names,
-        "transition_places": tuple(where[:count] for where, count in times),
-        "final_places": tuple(int(where[count]) if len(where) > count else -1 for where, count in times),
-        "parameter_units": {name: parameter.unit for name, parameter in parameters.items()},
-        "fixed": tuple(name for name, parameter in parameters.items() if parameter.fixed),
-        "sigma_known": problem.is_sigma_known,
-        "priors": {name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
-        "log_scaled": unknowns.log_names,
-        "log_origins": unknowns.origin,
-        "least_squares": problem.is_least_squares,
-    }
+    is_other = kind in ("gauss-newton", "none") and np.isfinite(result.cost)
+    return Solution(
+        theta=result.theta,
+        transition_times=tuple(times),
+        parameters={name: np.array(value) for name, value in parameters.items()},
+        gradient=result.gradient,
+        hessian=evaluator(result.theta).hessian if is_other else result.hessian,
+        hessian_kind=kind,
+        constraints=result.equalities,
+        free_basis=result.free_basis,
+        engine=evaluator.engine,
+        integration_error=error,
+        integration_error_of=output,
+    )

@@ -66,6 +66,9 @@ class Termination(Printed):
     active : tuple of ActiveConstraint
     kinks : tuple of Kink
     idle : tuple of str
+        Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of zero
+        duration between two intervals of the same mode, and parameters that act in collapsed modes alone. Their values
+        are arbitrary, and they are not in `free_basis`.
     smallest_eigenvalue : float
         Smallest eigenvalue of the Hessian on the free directions, each unknown scaled to unit curvature, if the status
         is SADDLE or SINGULAR; else NaN.
@@ -77,7 +80,10 @@ class Termination(Printed):
         Why the line search failed, or the error with which the fit ended. If a function compares with an unknown, and
         the fit ended at a jump of J in it or with a large integration error, a "switch": the unknown, which function
         and where; also of a fit that has converged.
-    unread, absent : tuple of str
+    unread : tuple of str
+        Parameters that no function of the model reads: J does not depend on them.
+    absent : tuple of str
+        Parameters that are read only by modes, or at transitions, that do not occur in any mode_sequence.
 
     See Also
     --------

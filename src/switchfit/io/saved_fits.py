@@ -33,6 +33,17 @@ from switchfit.uncertainty.verdict import Verdict, judge
 FIT_FORMAT = "switchfit fit"
 FIT_VERSION = 11
 
+FIT_FIELDS = (
+    "status", "cost", "optimality", "tolerance", "iterations", "earlier_iterations", "active", "kinks", "idle",
+    "smallest_eigenvalue", "flat_direction", "violated", "reason", "unread", "absent", "theta_names", "theta_units",
+    "initial_theta", "theta", "lower", "upper", "run_names", "transition_times", "transition_places", "final_places",
+    "parameters", "parameter_units", "fixed", "gradient", "hessian", "evaluations", "history", "free_basis",
+    "trajectories", "comparisons", "sigma_known", "integration_error", "hessian_kind", "seconds", "log_origins",
+    "constraints", "saved_gauss_newton", "saved_pieces", "saved_piece_places", "priors", "log_scaled",
+    "least_squares", "engine", "integration_error_of", "starts", "rivals", "steps", "initial_cost",
+)  # fmt: skip
+"""Fields of a fit in the order of the file: those of all its records, side by side."""
+
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provenance | None = None) -> None:
     """Write a fit to a file, whole or not at all.
@@ -68,7 +79,8 @@ def write_fit(fit: Fit, certificate: Certificate) -> dict[str, Any]:
     certificate : Certificate
     """
     verdict = judge(fit, certificate)
-    sealed = {"fit": to_json(fit, Fit), "certificate": to_json(certificate, Certificate)}
+    fields = to_json(fit, Fit)
+    sealed = {"fit": {name: fields[name] for name in FIT_FIELDS}, "certificate": to_json(certificate, Certificate)}
     return {
         "verdict": {"level": verdict.level, "text": str(verdict)} | to_json(verdict, Verdict),
         "format": FIT_FORMAT,
