@@ -12,7 +12,7 @@ from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,22 +28,33 @@ CHUNKS_FOR_ONE_MORE_THREAD = 8
 """Chunks a core from which there is one thread more than cores."""
 
 
+class Work(Protocol):
+    """What `run_chunks` does: runs, by their numbers; for a Dask cluster it must survive pickling."""
+
+    @property
+    def size(self) -> int:
+        """Number of runs in a chunk."""
+
+    def __call__(self, runs: range) -> Arrays:
+        """Return arrays with one entry for each of some runs."""
+
+    def fingerprint(self) -> str:
+        """Return a digest that changes with everything that a result depends on."""
+
+
 def _count_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_chunks(
-    work: Any, count: int, *, client: Any = None, folder: Path | None = None, progress: Progress = lambda *done: None
+    work: Work, count: int, *, client: Any = None, folder: Path | None = None, progress: Progress = lambda *done: None
 ) -> tuple[NDArray[np.intp], Arrays]:
     """Do all runs 0 .. count - 1, in chunks.
 
     Parameters
     ----------
-    work : object
-        Called with the range of runs of a chunk, it returns arrays with one entry for each. It has the number of runs
-        in a chunk, `size`, and ``fingerprint()``, a digest that changes with everything that a result depends on. For a
-        Dask cluster it must survive pickling.
+    work : Work
     count : int
     client : dask.distributed.Client, optional
         Where the chunks are computed; in threads of this process, one a core, if left out. A chunk whose worker is
@@ -95,7 +106,7 @@ def run_chunks(
     return runs, {name: np.concatenate([results[chunk][name] for chunk in finished]) for name in results[finished[0]]}
 
 
-def _run_in_threads(work: Any, chunks: list[range]) -> Generator[tuple[range, Arrays]]:
+def _run_in_threads(work: Work, chunks: list[range]) -> Generator[tuple[range, Arrays]]:
     """Yield chunks as they are done by threads; JAX's programs run outside Python's lock."""
     cores = _count_cores()
     # One thread more where there are many chunks: it works while another one waits for the lock.
@@ -109,7 +120,7 @@ def _run_in_threads(work: Any, chunks: list[range]) -> Generator[tuple[range, Ar
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _run_on_cluster(work: Any, chunks: list[range], client: Any) -> Generator[tuple[range, Arrays]]:
+def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Generator[tuple[range, Arrays]]:
     """Yield chunks as they are done by the workers of a Dask cluster.
 
     The work travels as bytes that are themselves the result of a task, so that they outlive the workers that hold
@@ -136,10 +147,11 @@ def _receive(blob: bytes) -> bytes:
 
 
 @functools.lru_cache(maxsize=4)
-def _unpickle(blob: bytes) -> Any:
+def _unpickle(blob: bytes) -> Work:
     import cloudpickle
 
-    return cloudpickle.loads(blob)
+    work: Work = cloudpickle.loads(blob)
+    return work
 
 
 def _run_remotely(blob: bytes, chunk: range) -> Arrays:

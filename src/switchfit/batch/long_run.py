@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.batch.chunks import run_chunks
+from switchfit.batch.chunks import Work, run_chunks
 from switchfit.batch.interval_pieces import list_places
 from switchfit.batch.programs import Limits
 from switchfit.fit.hidden_switches import refuse_hidden_switches
@@ -52,7 +52,7 @@ class LongRun(NamedTuple):
         return cls(limits, client, folder, callback, time.perf_counter())
 
 
-def repeat(problem: Problem, work: Any, count: int, title: str, how: LongRun) -> dict[str, Any]:
+def repeat(problem: Problem, work: Work, count: int, title: str, how: LongRun) -> dict[str, Any]:
     """Do `count` runs with a bar on the terminal: the fields of `Fits`.
 
     Parameters

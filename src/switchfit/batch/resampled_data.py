@@ -27,7 +27,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
@@ -75,7 +74,7 @@ class ResampledNoise:
             if not 1 <= self.block <= longest:
                 raise ValueError(f"block must lie between 1 and the {longest} samples there are; got {block}.")
 
-    def __call__(self, rng: np.random.Generator, clean: FloatArray, item: Any) -> FloatArray:
+    def __call__(self, rng: np.random.Generator, clean: FloatArray, item: Measurements) -> FloatArray:
         """Return drawn residuals for the values of a data item, around the clean ones: (K, q)."""
         # By identity: two `Measurements` with equal arrays are two sensors, and equality of arrays is no bool.
         pool = next(pool for own, pool in zip(self.items, self.pools, strict=True) if own is item)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,7 +27,8 @@ from switchfit.problem.validation.arrays import as_array
 from switchfit.problem.validation.messages import shorten
 from switchfit.problem.variants import replace_values
 
-Noise = float | ArrayLike | Callable[[np.random.Generator, FloatArray, Any], ArrayLike] | None
+DrawNoise = Callable[[np.random.Generator, FloatArray, Measurements], ArrayLike]
+Noise = float | ArrayLike | DrawNoise | None
 
 Values = dict[tuple[int, int], FloatArray]
 """Values of data that are simulated, by the experiment and the place among its data: (K, q), or (R, K, q) of R runs."""
@@ -67,7 +67,7 @@ def _simulate_clean(problem: Problem, truth: FloatArray) -> Values:
     return found
 
 
-def _find_spreads(problem: Problem, truth: FloatArray, noise: Any, clean: Values) -> Values:
+def _find_spreads(problem: Problem, truth: FloatArray, noise: float | ArrayLike | None, clean: Values) -> Values:
     """Return the standard deviations of the noise of all data, (K, q) each."""
     found = {}
     for (e, k), values in clean.items():
@@ -124,7 +124,7 @@ class SimulatedStudy(Study):
         As of `_simulate_clean`.
     """
 
-    noise: Any
+    noise: DrawNoise | Values
     clean: Values
 
     def draw_run(self, run: int) -> Values:

@@ -16,12 +16,12 @@ References
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.arrays import FloatArray, Traced
+from switchfit.arrays import ArrayModule, FloatArray, Traced
 
 POWERS = {"D": 0.0, "A": 1.0, "E": 1e3}
 """Powers q of the criteria; that of E stands for infinity, from which log m differs by less than 0.001 log s."""
@@ -46,7 +46,7 @@ class Criterion(NamedTuple):
     basis: FloatArray
     size: FloatArray
 
-    def rate(self, information: Traced, power: float, xp: Any = np) -> tuple[Traced, Traced]:
+    def rate(self, information: Traced, power: float, xp: ArrayModule = np) -> tuple[Traced, Traced]:
         """Return log m (...,), and its derivative in the information (..., d, d).
 
         Parameters

@@ -269,8 +269,9 @@ class Tracker:
         return np.maximum.accumulate(kept.times + moved[:, A : A + self.settings.births], axis=1)
 
     def _propagate(
-        self, kept: Sequences, moved: FloatArray, times: FloatArray, births: Any, last: int, *, recentres: bool
-    ) -> Hypotheses:
+        self, kept: Sequences, moved: FloatArray, times: FloatArray, births: Integers | int, last: int, *,
+        recentres: bool,
+    ) -> Hypotheses:  # fmt: skip
         """Return hypotheses from the start of the window anew to a node, with so many births (B,) at times (B, S)."""
         start, (_, S, A, _, _) = self.start, self.settings
         moved = moved.copy()

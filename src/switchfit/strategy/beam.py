@@ -31,9 +31,9 @@ turns of the benchmark 24 of 24 starts then end right; 7 with `REPLAYS` as of a 
 from __future__ import annotations
 
 import threading
+from collections.abc import Hashable
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -378,8 +378,8 @@ class Pass:
         return kept._replace(times=times, last=last), found
 
     def propagate(
-        self, start: Hypotheses, kept: Sequences, births: Any, times: FloatArray, stop: int, first: int | None = None,
-        *, recentres: bool = True,
+        self, start: Hypotheses, kept: Sequences, births: Integers | int, times: FloatArray, stop: int,
+        first: int | None = None, *, recentres: bool = True,
     ) -> Hypotheses:  # fmt: skip
         """Return hypotheses from a start, at node `first` or at t0, anew to another node, with so many births (B,) at
         times (B, S'), whose slots are the last ones.
@@ -533,10 +533,10 @@ def prepare(problem: Problem, e: int, library: Library | None = None, grid: floa
     """Return the beam of an experiment, built once for each problem, library and grid; without a library that of the
     given order of modes. It raises ValueError as `Beam` does.
     """
-    known: dict[Any, Beam] = problem.__dict__.setdefault("beams", {})
+    known: dict[Hashable, Beam] = problem.__dict__.setdefault("beams", {})
     # All of the library that tracing depends on. The modes with which a sequence begins and ends, and how long each
     # lasts, are rules of a pass.
-    key: Any = e, grid, library and (library.modes, tuple(library.successions.items()), library.max_switches)
+    key: Hashable = e, grid, library and (library.modes, tuple(library.successions.items()), library.max_switches)
     if key not in known:
         known[key] = Beam(problem, e, library, grid)
     return known[key]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 from switchfit.problem.consistency import check_durations
 from switchfit.problem.problem import Problem
@@ -75,13 +74,13 @@ class Library:
 
 def build_library(
     problem: Problem,
-    library: Any = None,
+    library: str | Iterable[str] | None = None,
     *,
-    first: Any = None,
-    last: Any = None,
-    successions: Any = None,
-    min_duration: Any = None,
-    max_switches: Any = 8,
+    first: str | Iterable[str] | None = None,
+    last: str | Iterable[str] | None = None,
+    successions: Mapping[str, str | Sequence[str]] | None = None,
+    min_duration: float | Mapping[str, float] | None = None,
+    max_switches: int = 8,
 ) -> Library:
     """Return the library of a search from the arguments of `find_modes`, checked.
 
@@ -115,7 +114,7 @@ def build_library(
     return found
 
 
-def _choose_modes(given: Any, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
+def _choose_modes(given: object, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
     """Return the given modes among some names, in their order; all if they are left out."""
     if given is None:
         return names
@@ -126,7 +125,7 @@ def _choose_modes(given: Any, what: str, names: tuple[str, ...]) -> tuple[str, .
     return tuple(name for name in names if name in chosen)
 
 
-def _check_successions(given: Any, names: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+def _check_successions(given: object, names: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     """Return the modes that may follow each mode; a mode that a mapping leaves out has none."""
     if given is None:
         return {name: tuple(other for other in names if other != name) for name in names}
@@ -147,7 +146,7 @@ def _check_successions(given: Any, names: tuple[str, ...]) -> dict[str, tuple[st
     return found
 
 
-def _read_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> dict[str, float]:
+def _read_durations(problem: Problem, given: object, names: tuple[str, ...]) -> dict[str, float]:
     """Return the shortest duration of each mode; that of the problem where it is left out."""
     found = {name: problem.durations[name] for name in names}
     if given is not None:

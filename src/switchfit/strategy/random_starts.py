@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.optimize.least_distance import nearest_feasible
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 
 MOST_DRAWN = 2**30
@@ -76,7 +76,7 @@ def _compute_ranges(problem: Problem) -> tuple[FloatArray, FloatArray, NDArray[n
     return np.where(is_time, 0.0, low), np.where(is_time, 1.0, high), ratio
 
 
-def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[float, float, NDArray[np.intp]]]:
+def _list_stretches(experiment: Experiment, where: NDArray[np.intp]) -> list[tuple[float, float, NDArray[np.intp]]]:
     """Return groups of free transition times with the fixed times (or ends of the horizon) that enclose them."""
     knots = np.concatenate([[experiment.t0], experiment.initial_times, [experiment.end]])
     fixed = [0, *(np.flatnonzero(where < 0) + 1).tolist(), len(knots) - 1]

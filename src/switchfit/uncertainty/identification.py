@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from switchfit.fit.data_variation import measure_variation
 from switchfit.fit.hidden_switches import refuse_hidden_switches
 from switchfit.fit.result import Fit
 from switchfit.fit.scaled_hessian import compute_scaled_spectrum, moves_by_itself
+from switchfit.fit.solved_fit import SolvedFit
 from switchfit.meshes.evaluator import Evaluator, evaluator_of
 from switchfit.optimize.curvature import null_space
 from switchfit.problem.measurements import Measurements
@@ -181,7 +182,7 @@ class Identifiability(Printed):
         return len(self.without) + int(np.sum(self.eigenvalues < UNDETERMINED_COMBINATION))
 
 
-def identifiability(subject: Any) -> Identifiability:
+def identifiability(subject: SolvedFit | Problem) -> Identifiability:
     """Return how well the data determine the unknowns, at the solution of a fit or, before any fit, at the first guess.
 
     Parameters
@@ -213,9 +214,8 @@ def identifiability(subject: Any) -> Identifiability:
     """
     if isinstance(subject, Problem):
         return _analyse_first_guess(subject)
-    if isinstance(subject, Fit):
-        fit: Any = subject
-        return analyse_solution(fit, None if fit.problem is None else fit.evaluator_at_solution())
+    if isinstance(subject, SolvedFit):
+        return analyse_solution(subject, None if subject.problem is None else subject.evaluator_at_solution())
     raise TypeError(f"identifiability needs an sf.Estimate or an sf.Problem; got {type(subject).__name__}.")
 
 

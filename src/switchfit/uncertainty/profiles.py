@@ -27,18 +27,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
+from switchfit.engine.evaluation import Evaluation
 from switchfit.fit.minimization import minimize_cost
 from switchfit.fit.result import Fit
+from switchfit.fit.solved_fit import SolvedFit
 from switchfit.meshes.evaluator import Evaluator
 from switchfit.meshes.follower import Follower
 from switchfit.meshes.halving import halve_cells
-from switchfit.optimize import Status
+from switchfit.optimize import Result, Status
 from switchfit.optimize.least_distance import nearest_feasible
 from switchfit.problem.validation.arrays import as_level
 from switchfit.problem.validation.messages import join_names, shorten, unit_suffix
@@ -278,7 +279,7 @@ class Profile(Tabular, Displayed):
 
     # --- adding points
 
-    def _describe(self, theta: FloatArray, found: Any, converged: bool) -> ProfilePoint:
+    def _describe(self, theta: FloatArray, found: Evaluation[FloatArray] | Result, converged: bool) -> ProfilePoint:
         """Return the point at theta, where the other unknowns are optimal: its slope is the derivative of the cost."""
         k, c = self._index, self._constraints
         others = (theta > c.lower) & (theta < c.upper) & found.hessian.any(axis=1)
@@ -487,7 +488,7 @@ class Profile(Tabular, Displayed):
         return float(side * np.inf) if end == "flat" else float("nan")
 
 
-def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
+def profile(estimate: SolvedFit, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
     """Return the profile likelihood of one parameter or transition time.
 
     Parameters
@@ -530,13 +531,13 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     >>> [round(float(end), 1) for end in sf.profile(fit, "tau_1").interval(0.95)]
     [2.4, 2.5]
     """
-    fit = as_instance(estimate, "estimate", Fit, "what sf.estimate returns: fit the problem first")
+    fit = as_instance(estimate, "estimate", SolvedFit, "what sf.estimate returns: fit the problem first")
     if as_name(name, "name") not in fit.theta_names:
         raise ValueError(f"there is no unknown {shorten(name)}; the unknowns are {join_names(fit.theta_names)}.")
     level = as_level(level)
     if callback is not None:
         as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
-    evaluator = estimate.evaluator_at_solution()
+    evaluator = fit.evaluator_at_solution()
     if not fit.status.successful:
         raise ValueError(f"a profile begins at a minimum, and this fit has not found one: {fit.message}")
     if fit.constraints:
