@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -29,7 +29,7 @@ def command(*options: str) -> Callable[[Callable[..., None]], Callable[..., None
 
     def decorate(run: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(run)
-        def run_command(**given: Any) -> None:
+        def run_command(**given: object) -> None:
             asked_options.update(name for name in names if given.pop(name))
             try:
                 with report_errors():

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import switchfit as sf
 from switchfit.cli import command, errors, files, options, terminal
 from switchfit.cli.options import option, output_folder
 from switchfit.runtime.files import write_atomically
+
+if TYPE_CHECKING:
+    from switchfit.experiment_design.result import Design
 
 DesignFolder = Annotated[
     Path | None, output_folder("design.txt, design.json, design.png, and the designed input and sample times as CSV")
@@ -54,7 +57,7 @@ def design(
         errors.end_unreliable(f"{', '.join(lost)} cannot be estimated from such an experiment.")
 
 
-def _write_plan(plan: Any, folder: Path) -> None:
+def _write_plan(plan: Design, folder: Path) -> None:
     """Write the input and the samples of a design as CSV."""
     from switchfit.cli.tables import write_rows, zip_rows
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from switchfit.cli.terminal import print_json, print_note, print_text
 from switchfit.runtime.errors import InputError
@@ -18,14 +18,23 @@ FIGURE_DPI = 150
 """Dots per inch of a figure."""
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+Result: TypeAlias = Any
+"""A result of the library, which has text. It has ``plot`` where a format of figures is given, ``save`` where it is to
+be saved: the command knows which of its results have them."""
 
 
-def load(problem: Path, out: Path | None = None, **how: Any) -> ProblemFile:
+def load(
+    problem: Path,
+    out: Path | None = None,
+    *,
+    log: Path | None = None,
+    searched: bool = False,
+    streamed: bool = False,
+) -> ProblemFile:
     """Load a problem file as `load_problem` does, and create the folder for the results."""
     from switchfit.io.problem_file.loading import load_problem
 
-    loaded = load_problem(problem, **how)
+    loaded = load_problem(problem, log, searched=searched, streamed=streamed)
     make_folder(out)
     return loaded
 
@@ -36,7 +45,7 @@ def make_folder(folder: Path | None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
 
-def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) -> None:
+def write_result(result: Result, stem: Path, figures: str, *, saved: bool = False) -> None:
     """Write the text of a result, its figure if `figures` names a format, and the result itself if it is to be saved.
 
     The files differ in their endings. Say where they are.
@@ -50,7 +59,7 @@ def write_result(result: Any, stem: Path, figures: str, *, saved: bool = False) 
 
 
 def show(
-    result: Any, summary: dict[str, Any], out: Path | None, name: str, figures: str, *, saved: bool = False
+    result: Result, summary: dict[str, Any], out: Path | None, name: str, figures: str, *, saved: bool = False
 ) -> None:
     """Print a result, and write it as `write_result` does, if there is a folder for it."""
     print_text(result)
@@ -59,7 +68,7 @@ def show(
     print_json(summary | {"out": out})
 
 
-def write_figure(result: Any, path: Path) -> None:
+def write_figure(result: Result, path: Path) -> None:
     """Write the figure of a result; the ending of the name is its format."""
     os.environ.setdefault("MPLBACKEND", "Agg")
     content = io.BytesIO()

@@ -11,9 +11,9 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from string import Template
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
 from switchfit.cli.examples import find_examples
@@ -195,7 +195,7 @@ def _fill_template(name: str, **values: object) -> str:
     return Template((TEMPLATES / name).read_text(encoding="utf-8")).substitute(values)
 
 
-def _format(values: Any, digits: int = 4) -> str:
+def _format(values: ArrayLike, digits: int = 4) -> str:
     """Return a number with a few digits, as a float of TOML; a list of them for an array of several."""
     shown = [repr(float(f"{value:.{digits}g}")) for value in np.ravel(values).tolist()]
     return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"

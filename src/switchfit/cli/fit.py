@@ -22,7 +22,10 @@ from switchfit.runtime.files import write_atomically
 from switchfit.runtime.presentation import format_count, format_page, format_text
 
 if TYPE_CHECKING:
+    from switchfit.estimation.estimates import Estimate
+    from switchfit.estimation.provenance import Provenance
     from switchfit.io.problem_file.building import ProblemFile
+    from switchfit.optimize.result import IterationRecord
 
 Problems = Annotated[
     list[Path], argument("PROBLEM.toml", "Problem file; with --problem, logs, each of which is fitted by itself.")
@@ -106,15 +109,13 @@ def _override(loaded: ProblemFile, options: dict[str, Any]) -> ProblemFile:
     return replace(loaded, options=loaded.options | options)
 
 
-def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Any:
+def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Estimate:
     """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
     importing = threading.Thread(target=_import_figures, daemon=True)
     if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
         importing.start()
-    with interrupts.stop_on_interrupt(
-        lambda r: f"iteration {r.iteration}: J = {r.cost:.6g}, optimality {r.optimality:.1e}"
-    ) as report:
+    with interrupts.stop_on_interrupt(_describe_iteration) as report:
         estimate = sf.estimate(loaded.problem, callback=report, **loaded.options)
     if prepare_figures:
         importing.join()  # two threads that import modules of one package in different orders find some half made
@@ -127,6 +128,10 @@ def estimate_problem(loaded: ProblemFile, *, prepare_figures: bool) -> Any:
     return estimate
 
 
+def _describe_iteration(record: IterationRecord) -> str:
+    return f"iteration {record.iteration}: J = {record.cost:.6g}, optimality {record.optimality:.1e}"
+
+
 @dataclass(frozen=True)
 class Output:
     """What is printed of a fit, and written; the format of the figure, empty for none."""
@@ -137,7 +142,7 @@ class Output:
     full: bool
 
 
-def write_estimate(estimate: Any, loaded: ProblemFile, output: Output, *, show: bool = True) -> None:
+def write_estimate(estimate: Estimate, loaded: ProblemFile, output: Output, *, show: bool = True) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
     from switchfit.cli.tables import list_tables
 
@@ -207,7 +212,7 @@ def _import_figures() -> None:
         import switchfit.report.html.page  # noqa: F401  # with Bokeh and Jinja2
 
 
-def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None:
+def _save(estimate: Estimate, path: Path, provenance: Provenance | None, *, complete: bool) -> None:
     """Save an estimate; unless `complete`, its certificate omits the paper's equations, which take seconds."""
     from switchfit.io.saved_fits import save_fit
     from switchfit.uncertainty.certificate import certify
@@ -216,7 +221,7 @@ def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None
     save_fit(estimate.complete(), certificate, path, provenance)
 
 
-def _write_page(estimate: Any, provenance: Any, path: Path) -> None:
+def _write_page(estimate: Estimate, provenance: Provenance | None, path: Path) -> None:
     """Write the report as an HTML file; without the libraries that it needs, say how to install them."""
     try:
         page = format_page(estimate, provenance=provenance)

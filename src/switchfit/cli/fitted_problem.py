@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from switchfit.cli.toml_writer import write_table
 from switchfit.estimation.estimates import Estimate
@@ -75,6 +76,7 @@ def _describe_run(estimate: Estimate, e: int, run: Experiment) -> dict[str, Any]
     return found
 
 
-def _confine(value: Any, lower: Any, upper: Any) -> Any:
+def _confine(value: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> float | list[float]:
     """Return an estimate as numbers of Python; rounding must not take it over a bound."""
-    return np.clip(np.asarray(value, dtype=float), lower, upper).tolist()
+    confined: float | list[float] = np.clip(np.asarray(value, dtype=float), lower, upper).tolist()
+    return confined

@@ -7,11 +7,12 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import Any, NoReturn
+from typing import NoReturn, TypeVar
 
 from switchfit.cli.terminal import is_asked, print_note
 
-# --- errors -----------------------------------------------------------------------------------------------------------
+Progress = TypeVar("Progress")
+"""What a fit or a search tells its callback."""
 
 
 class CtrlC(KeyboardInterrupt):
@@ -40,7 +41,9 @@ def handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iter
 
 
 @contextlib.contextmanager
-def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -> Iterator[Callable[[Any], bool]]:
+def stop_on_interrupt(
+    describe: Callable[[Progress], str], part: str = "iteration"
+) -> Iterator[Callable[[Progress | None], bool]]:
     """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt.
 
     It has the callback of a fit or a search, which says with --verbose how far that is, in the words of `describe`;
@@ -58,7 +61,7 @@ def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -
         requested.set()
         print_note(f"stopping after this {part}; Ctrl-C again to stop at once")
 
-    def report(progress: Any) -> bool:
+    def report(progress: Progress | None) -> bool:
         if is_asked("verbose") and progress is not None:
             print_note(f"  {describe(progress)}")
         return requested.is_set()

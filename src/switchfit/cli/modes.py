@@ -13,6 +13,8 @@ from switchfit.runtime.files import write_atomically
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
+    from switchfit.modes.result import ModeSearch
+    from switchfit.modes.search_run import SearchProgress
 
 USABLE = {"FOUND", "UNIDENTIFIED", "AMBIGUOUS", "AT_LIMIT"}
 """Statuses of a search whose best sequence explains the data."""
@@ -67,10 +69,10 @@ def modes(
         errors.end_unreliable("no mode sequence to rely on; the first line of the result says why, and what to do.")
 
 
-def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
+def _search(loaded: ProblemFile, settings: dict[str, Any]) -> ModeSearch:
     """Call `switchfit.find_modes`, which shows a line on a terminal; Ctrl-C ends the search after the current fit."""
 
-    def describe(progress: Any) -> str:
+    def describe(progress: SearchProgress) -> str:
         best = " | ".join(" -> ".join(sequence) for sequence in progress.sequences) or "none"
         return f"{progress.stage}: {progress.fits} fits, J = {progress.cost:.6g}, {best}"
 
@@ -78,7 +80,7 @@ def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
         return sf.find_modes(loaded.problem, callback=report, **settings)
 
 
-def _write_best(search: Any, loaded: ProblemFile, folder: Path) -> Path | None:
+def _write_best(search: ModeSearch, loaded: ProblemFile, folder: Path) -> Path | None:
     """Write the best mode sequence as a problem file; return its path, None if there is none."""
     from switchfit.cli.fitted_problem import write_fitted_problem
 

@@ -6,19 +6,22 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from typer.models import ArgumentInfo, OptionInfo
 
 
-def option(*names: str, help: str, metavar: str | None = None) -> Any:
+def option(*names: str, help: str, metavar: str | None = None) -> OptionInfo:
     """Return an option; its help says what holds without it."""
-    return typer.Option(*names, metavar=metavar, help=help, show_default=False)
+    found: OptionInfo = typer.Option(*names, metavar=metavar, help=help, show_default=False)
+    return found
 
 
-def argument(metavar: str, help: str, **more: Any) -> Any:
+def argument(metavar: str, help: str, **more: Any) -> ArgumentInfo:
     """Return a positional argument."""
-    return typer.Argument(metavar=metavar, help=help, show_default=False, **more)
+    found: ArgumentInfo = typer.Argument(metavar=metavar, help=help, show_default=False, **more)
+    return found
 
 
-def output_folder(content: str) -> Any:
+def output_folder(content: str) -> OptionInfo:
     """Return the option --out for a folder with some content."""
     return option(metavar="DIR", help=f"Folder for {content}. Left out, nothing is written.")
 
@@ -42,6 +45,6 @@ FigureFormat = Annotated[
 ]
 
 
-def select_given(**options: Any) -> dict[str, Any]:
+def select_given(**options: object) -> dict[str, Any]:
     """Return the options that are given; the others are None."""
     return {name: value for name, value in options.items() if value is not None}

@@ -44,7 +44,7 @@ def read_sample(line: bytes, run: Experiment) -> tuple[Any, Any, Any]:
     return t, _fill(y), u
 
 
-def _fill(y: Any) -> Any:
+def _fill(y: object) -> object:
     """Return values with NaN for null."""
     if isinstance(y, dict):
         return {name: np.nan if value is None else value for name, value in y.items()}

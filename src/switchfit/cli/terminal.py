@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from typing import Any
 
 import typer
 
@@ -30,13 +29,13 @@ def print_text(text: object) -> None:
         _print(text)
 
 
-def print_json(value: Any) -> None:
+def print_json(value: object) -> None:
     """Print the result as JSON, if it is asked for."""
     if is_asked("json"):
         _print(format_json(value))
 
 
-def format_json(value: Any) -> str:
+def format_json(value: object) -> str:
     """Return a value as one line of JSON; numbers that are not finite are null."""
     from pydantic_core import to_json
 

@@ -41,7 +41,7 @@ def write_table(table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterato
                 yield from ("", f"[[{name}]]", *write_table(entry, inner))
 
 
-def _is_nested(key: str, value: Any) -> bool:
+def _is_nested(key: str, value: object) -> bool:
     """Return whether a value is a table of its own, or a list of them; not so a parameter with the name of a list."""
     return (
         isinstance(value, Mapping)
@@ -59,7 +59,7 @@ def _write_text(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def write_value(value: Any) -> str:
+def write_value(value: object) -> str:
     """Return a value as it stands in a line.
 
     Parameters

@@ -12,9 +12,16 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 from switchfit.runtime.errors import InputError, get_first_line
+
+UserObject: TypeAlias = Any
+"""An object of a user's Python file, or what one returns: whoever asks for it checks what it is."""
+
+Given = ParamSpec("Given")
+Built = TypeVar("Built")
 
 _REFERENCE = re.compile(r"(.+\.py):(\w+)")
 """How a problem file names an object in a Python file."""
@@ -23,7 +30,7 @@ _REFERENCE = re.compile(r"(.+\.py):(\w+)")
 _files: dict[str | None, Path] = {}
 
 
-def load_object(reference: str, folder: Path, what: str) -> Any:
+def load_object(reference: str, folder: Path, what: str) -> UserObject:
     """Return the object that ``"file.py:object"`` names.
 
     Parameters
@@ -71,30 +78,34 @@ def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
     return path, match[2]
 
 
-def replace_files(contents: Any, change: Callable[[str], str]) -> Any:
-    """Return tables of a problem file with other names of files: of logs, and of Python files with their objects.
+def replace_files(table: Mapping[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
+    """Return a table of a problem file with other names of files: of logs, and of Python files with their objects.
 
     Parameters
     ----------
-    contents : mapping, sequence, or anything else
-        Arguments of models are left as they are.
+    table : mapping
+        Arguments of models in it are left as they are.
     change : callable
         Returns the new name for a name.
     """
-    if isinstance(contents, Mapping):
-        changed = {
-            key: value if key == "arguments" else replace_files(value, change) for key, value in contents.items()
-        }
-        if "columns" in contents and "file" in contents:
-            changed["file"] = change(contents["file"])
-        return changed
-    if isinstance(contents, (list, tuple)):
-        return [replace_files(entry, change) for entry in contents]
-    match = _REFERENCE.fullmatch(contents) if isinstance(contents, str) else None
-    return contents if match is None else f"{change(match[1])}:{match[2]}"
+    changed = {key: value if key == "arguments" else _replace_in(value, change) for key, value in table.items()}
+    # The name of a log is any text: it is told by its key, and that also by `columns`, which all tables of logs have.
+    if "columns" in table and "file" in table:
+        changed["file"] = change(table["file"])
+    return changed
 
 
-def call(function: Callable[..., Any], what: str, **arguments: Any) -> Any:
+def _replace_in(value: object, change: Callable[[str], str]) -> object:
+    """Return the value of a key with other names of files: of Python files by their form, ``"file.py:object"``."""
+    if isinstance(value, Mapping):
+        return replace_files(value, change)
+    if isinstance(value, (list, tuple)):
+        return [_replace_in(entry, change) for entry in value]
+    match = _REFERENCE.fullmatch(value) if isinstance(value, str) else None
+    return value if match is None else f"{change(match[1])}:{match[2]}"
+
+
+def call(function: Callable[..., UserObject], what: str, **arguments: object) -> UserObject:
     """Call a user's factory; raise InputError if it does not take the arguments, or with the place if it fails."""
     try:
         inspect.signature(function).bind(**arguments)
@@ -119,7 +130,7 @@ def _explain_failure(what: str) -> Iterator[None]:
         raise InputError(f"{what} failed: {describe_error(error)}.") from error
 
 
-def build_at(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+def build_at(where: str, build: Callable[Given, Built], *arguments: Given.args, **named: Given.kwargs) -> Built:
     """Return what a function builds; add the place in the problem file to its error messages.
 
     Parameters
@@ -175,7 +186,7 @@ def find_user_place(error: BaseException | None) -> str | None:
 
 
 @functools.cache
-def _run(key: str, changed: int) -> Any:
+def _run(key: str, changed: int) -> ModuleType:
     """Return the module of a file; one that several keys name runs once, until the time of its last change differs."""
     path = _files[key]
     specification = importlib.util.spec_from_file_location(f"switchfit_user_{path.stem}", key)

@@ -12,7 +12,7 @@ from switchfit.fit.result import Fit
 from switchfit.fit.simulation import simulate
 from switchfit.optimize import Status
 from switchfit.paper.table_rows import Found
-from switchfit.paper.vehicle import curve, positions_at, stick_slip
+from switchfit.paper.vehicle import Restick, curve, positions_at, stick_slip
 from switchfit.problem.reference_signals import ReferenceSignal
 from switchfit.uncertainty.certificate import certify
 
@@ -31,9 +31,16 @@ def complete(fit: Fit) -> Fit:
     return fit
 
 
-def fit_log(reference: ReferenceSignal, start: tuple[float, ...], exact: FloatArray, **settings: Any) -> Found:
-    """Fit (18) to a log whose exact positions at each second are (K, 2); the settings are those of `stick_slip`."""
-    problem = stick_slip(reference, start, **settings)
+def fit_log(
+    reference: ReferenceSignal,
+    start: tuple[float, ...],
+    exact: FloatArray,
+    *,
+    stick_force: float = 15.0,
+    restick: Restick = "continuous",
+) -> Found:
+    """Fit (18) to a log whose exact positions at each second are (K, 2)."""
+    problem = stick_slip(reference, start, stick_force=stick_force, restick=restick)
     fit = fit_locally(problem)
     path = fit.trajectory
     off = positions_at(path, np.arange(float(len(exact)))) - exact

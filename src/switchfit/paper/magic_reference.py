@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from switchfit.fit.evaluation import evaluate
@@ -15,6 +13,7 @@ from switchfit.paper.table_rows import Found, Say, TableRow
 from switchfit.paper.tyre_logs import TYRE_LOG_START
 from switchfit.paper.vehicle import SAMPLE_TIMES
 from switchfit.problem.experiment import Parameter
+from switchfit.problem.inputs import Input
 from switchfit.problem.measurements import Measurements
 from switchfit.report.style import MODE_COLOURS
 from switchfit.runtime.presentation import Figure
@@ -86,7 +85,7 @@ def _ramps(say: Say) -> list[Found]:
     return lines
 
 
-def _coefficients(speeds: Any, say: Say) -> Found:
+def _coefficients(speeds: Input, say: Say) -> Found:
     """Return the Hessian in the 16 coefficients at their true values, each relative to its own value."""
     say("Hessian in the 16 coefficients")
     times = np.linspace(0.0, 15.0, 151)

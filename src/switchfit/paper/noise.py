@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from switchfit.arrays import FloatArray
@@ -107,5 +105,5 @@ def list_noise(found: Found) -> list[TableRow]:
     ]
 
 
-def _list(values: Any, form: str) -> str:
+def _list(values: FloatArray, form: str) -> str:
     return ", ".join(format(value, form) for value in values)

@@ -7,14 +7,12 @@ involving the matrix exponential, IEEE Trans. Automat. Control 23 (1978) 395-404
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import expm
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, Traced
 from switchfit.fit.evaluation import evaluate
 from switchfit.optimize.minimization_problem import HessianKind
 from switchfit.paper import fit_summary, table_rows
@@ -77,7 +75,7 @@ def _reference() -> ReferenceSignal:
     return ReferenceSignal.from_samples(np.concatenate(times), np.concatenate(states))
 
 
-def _matrix(k: Any, c: Any) -> Any:
+def _matrix(k: Traced, c: Traced) -> jax.Array:
     return jnp.array([[0.0, 1.0], [-k, -c]])
 
 
@@ -90,7 +88,7 @@ def evaluate_exactly(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     return float(cost), gradient, hessian
 
 
-def _cost(theta: Any) -> Any:
+def _cost(theta: jax.Array) -> Traced:
     tau, k, c = theta
     true_tau, true_k, true_c = LTI_TRUTH
     Q = jnp.kron(jnp.array([[1.0, -1.0], [-1.0, 1.0]]), jnp.eye(2))

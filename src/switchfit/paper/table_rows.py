@@ -18,7 +18,7 @@ class TableRow(NamedTuple):
     remark: str = ""
 
 
-def fill_rows(text: str, **values: Any) -> list[TableRow]:
+def fill_rows(text: str, **values: object) -> list[TableRow]:
     """Return the lines of a template: each begins with "* ", and "|" is between its cells; values stand by their names.
 
     Parameters

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.arrays import FloatArray
+from switchfit.arrays import FloatArray, Traced
 from switchfit.fit.simulation import simulate
 from switchfit.fit.trajectory import Trajectory
 from switchfit.models.skid_steer import skid_steer
@@ -33,7 +33,7 @@ LOWPASS_HZ = 0.3
 Restick = Literal["continuous", "reset"]
 
 
-def position(t: Any, x: Any, p: Any) -> Any:
+def position(t: Traced, x: Traced, p: Traced) -> Traced:
     """Return the position that GPS measures: (X, Y)."""
     return x[jnp.array([0, 2])]
 
@@ -53,14 +53,17 @@ def stick_slip(
 
 
 def simulate_drive(
-    theta: tuple[float, float, float] = TRUTH, *, tf: float = HORIZON, step: float = 0.1, **settings: Any
+    theta: tuple[float, float, float] = TRUTH,
+    *,
+    tf: float = HORIZON,
+    step: float = 0.1,
+    stick_force: float = 15.0,
+    restick: Restick = "continuous",
 ) -> Trajectory:
-    """Simulate equation (18) at given transition times and mu, with a node every `step` seconds; the settings are those
-    of `stick_slip`.
-    """
+    """Simulate equation (18) at given transition times and mu, with a node every `step` seconds."""
     times = step * np.arange(round(tf / step) + 1)
     nothing = Measurements(times, np.zeros((len(times), 6)))
-    return simulate(stick_slip(nothing, theta, tf=tf, **settings))
+    return simulate(stick_slip(nothing, theta, tf=tf, stick_force=stick_force, restick=restick))
 
 
 def build_simulated_problem() -> Problem:

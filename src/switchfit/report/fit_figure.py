@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeGuard
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from switchfit.runtime.presentation import Axes, Figure
 from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.corrected_errors import find_transition_intervals
 from switchfit.uncertainty.prediction import Prediction, predict
+
+if TYPE_CHECKING:
+    from matplotlib.figure import SubFigure
 
 RUNS_SIDE_BY_SIDE, INCHES_OF_EACH_RUN = 4, (0.0, 8.0, 5.5, 4.5, 4.0)
 """Experiments side by side; inches of each of so many."""
@@ -130,14 +133,20 @@ def plot_runs(
 
 
 def _draw_outputs(
-    result: Fit | Validation, e: int, block: Any, rows: int, prediction: Prediction | None, level: float, label: str
+    result: Fit | Validation,
+    e: int,
+    block: SubFigure,
+    rows: int,
+    prediction: Prediction | None,
+    level: float,
+    label: str,
 ) -> list[Axes]:
     """Draw each channel of an experiment with its residuals below, leaving rows free at the bottom for others only."""
     outputs, step = list_outputs(result, e), 2 if result.comparisons[e] else 1
     ratios = ([3.0, 1.2] if step == 2 else [1.0]) * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
     axes: list[Axes] = [block.add_subplot(grid[0])]
-    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1 : step * len(outputs)]]
+    axes += [block.add_subplot(grid[row], sharex=axes[0]) for row in range(1, step * len(outputs))]
     for k, (comparison, channel) in enumerate(outputs):
         plot_comparison(comparison, channel, axes[step * k], label=label)
         if step == 2:

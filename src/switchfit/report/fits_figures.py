@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,15 +43,19 @@ def plot_fits(fits: Fits) -> Figure:
     fits : Fits
     """
     shown, width, height, most, title = list(range(len(fits.theta_names))), 3.4, 2.7, 3, ""
+    draw: Callable[[int, Axes], None]
     if isinstance(fits, Bootstrap):
-        draw: Any = draw_bootstrap
+        draw = partial(draw_bootstrap, fits)
         shown, title = np.flatnonzero(fits.resampled).tolist(), f"Bootstrap: {fits.resample}"
     elif isinstance(fits, MonteCarlo):
         failed = int((~fits.success).sum())
-        draw, title = draw_monte_carlo, f"{failed} runs that did not converge are left out" if failed else ""
+        draw, title = (
+            partial(draw_monte_carlo, fits),
+            f"{failed} runs that did not converge are left out" if failed else "",
+        )
     else:
         order = fits.worst_first[:DRAWN_FITS]
-        draw, title = partial(draw_rows, order=order), selection.count_worst(order, fits, "fits")
+        draw, title = partial(draw_rows, fits, order=order), selection.count_worst(order, fits, "fits")
         width, height, most = 2.9, 0.9 + 0.2 * max(len(order), 5), DRAWN_UNKNOWNS
         shown = select_unknowns_of_fits(fits, DRAWN_UNKNOWNS)
     if isinstance(fits, MonteCarlo | Bootstrap) and fits.success.sum() < 2:
@@ -61,7 +65,7 @@ def plot_fits(fits: Fits) -> Figure:
     figure = style.make_figure(width * columns + 0.5, height * rows + 0.5)
     axes = [figure.add_subplot(rows, columns, number + 1) for number in range(len(shown))]
     for number, panel in enumerate(axes):
-        draw(fits, shown[number], panel)
+        draw(shown[number], panel)
         if number % columns:
             panel.set_ylabel("")
             panel.tick_params(labelleft=False)

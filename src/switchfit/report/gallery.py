@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from switchfit.estimation.estimates import Estimate
 from switchfit.report.convergence import plot_convergence
@@ -12,14 +11,17 @@ from switchfit.report.plane import plot_plane
 from switchfit.report.timeline import plot_timeline
 from switchfit.runtime.presentation import Axes, Figure, draw_figure
 
-PLOTS: dict[str, Callable[..., Axes | Figure]]
-
-PLOTS = {"fit": plot_fit, "convergence": plot_convergence, "timeline": plot_timeline, "plane": plot_plane}
+PLOTS: dict[str, Callable[..., Axes | Figure]] = {
+    "fit": plot_fit,
+    "convergence": plot_convergence,
+    "timeline": plot_timeline,
+    "plane": plot_plane,
+}
 """Plots of an estimate by the end of the method's name: `Estimate.plot_plane` is "plane", `Estimate.plot` is "fit"."""
 
 
 @draw_figure.register(Estimate)
-def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: Any) -> Axes | Figure:
+def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: object) -> Axes | Figure:
     """Draw one of the plots of an estimate.
 
     Parameters

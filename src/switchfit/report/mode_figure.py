@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -33,13 +32,15 @@ def plot_search(search: ModeSearch) -> Figure:
     ----------
     search : ModeSearch
     """
-    runs = range(min(len(search.run_names), DRAWN_RUNS) if search.best is not None else 0)
+    best = search.best
+    runs = range(0 if best is None else min(len(search.run_names), DRAWN_RUNS))
     figure = style.make_figure(8.0, 2.8 + 4.2 * max(len(runs), 1 if search.chosen else 0))
     axes = figure.subplots(1 + 2 * len(runs), 1, squeeze=False, height_ratios=[1.0, *([1.2, 0.6] * len(runs))])[:, 0]
     plot_numbers(search, axes[0])
     colours = style.assign_colours(search.modes, MODE_COLOURS)
     for e, above, below in zip(runs, axes[1::2], axes[2::2], strict=True):
-        best: Any = search.best
+        if best is None:
+            break
         panels.plot_comparison(*panels.list_outputs(best, e)[0], above)
         panels.plot_modes(best.trajectories[e], above, colours=colours)
         above.set_title(search.run_names[e] if len(search.run_names) > 1 else "", loc="left", fontsize=SMALL)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from matplotlib import rcParams
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.legend import Legend
@@ -49,7 +50,7 @@ class NotebookFigure(Figure):
         self.savefig(picture, format="png", dpi=NOTEBOOK_FIGURE_DPI)
         return picture.getvalue()
 
-    def draw_legend(self, handles: Mapping[str, Any], *, most: int = 4, **settings: Any) -> None:
+    def draw_legend(self, handles: Mapping[str, Artist], *, most: int = 4, **settings: Any) -> None:
         """Draw the legend of all axes, with as many columns as the width has room for, also after it changes.
 
         Parameters
@@ -64,7 +65,7 @@ class NotebookFigure(Figure):
         self.legend_settings = {"handles": handles, "most": most, **settings}
         self.legend_drawn = self.legend(list(handles.values()), list(handles), **look, **settings)
 
-    def set_size_inches(self, w: Any, h: float | None = None, forward: bool = True) -> None:
+    def set_size_inches(self, w: float | tuple[float, float], h: float | None = None, forward: bool = True) -> None:
         """Set the size in inches, and draw the legend in the columns that it has room for."""
         super().set_size_inches(w, h, forward)
         if self.legend_drawn is not None and self.legend_drawn in self.legends:

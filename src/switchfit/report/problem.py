@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from switchfit.meshes.evaluator import Evaluator
+from switchfit.problem.data import Data
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.measurements import Measurements
 from switchfit.problem.problem import Problem
@@ -83,7 +83,7 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
     return [line for line in lines if line]
 
 
-def _describe_data(item: Any, experiment: Experiment) -> str:
+def _describe_data(item: Data, experiment: Experiment) -> str:
     """Return the channels of data, their span and number, and what is known of the sensor."""
     if isinstance(item, ReferenceSignal):
         knots, names = item.signal.knots, _join_channel_names(item.names, item.units, item.signal.channels)

@@ -17,6 +17,8 @@ from switchfit.report.times import Timed, label_time
 from switchfit.runtime.presentation import Axes, Figure
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+
     from switchfit.report.notebook_figure import NotebookFigure
 
 Drawn = TypeVar("Drawn", bound="Axes | Figure")
@@ -82,14 +84,14 @@ def open_axes(ax: Axes | None, size: tuple[float, float] = (6.4, 4.2)) -> tuple[
     return ax, ax
 
 
-def collect_handles(axes: Iterable[Axes]) -> dict[str, Any]:
+def collect_handles(axes: Iterable[Axes]) -> dict[str, Artist]:
     """Return the entries of one legend for several axes, by label: of equal labels the first.
 
     Parameters
     ----------
     axes : iterable of matplotlib.axes.Axes
     """
-    handles: dict[str, Any] = {}
+    handles: dict[str, Artist] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)

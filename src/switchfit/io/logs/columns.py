@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.io.logs.log import Log
@@ -71,7 +72,7 @@ def _are_uptimes(times: FloatArray) -> bool:
 
 def build_log(
     source: str,
-    columns: Mapping[str, Any],
+    columns: Mapping[str, NDArray[Any]],
     units: Mapping[str, str],
     options: Options,
     zones: Mapping[str, str] | None = None,
@@ -126,7 +127,7 @@ def build_log(
     )
 
 
-def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple[FloatArray, str, float]:
+def _convert_times(column: NDArray[Any], name: str, unit: str, keep_epoch: bool) -> tuple[FloatArray, str, float]:
     """Return times, their unit, and what was subtracted from them: the first one, if they count from 1970.
 
     Integers are subtracted as such; doubles would round them. With `keep_epoch` numbers are left as they are.

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,9 @@ MICROSECONDS_PER_DAY = 86_400_000_000
 """Microseconds."""
 
 EPOCH = date(1970, 1, 1)
+
+Sentence: TypeAlias = Any
+"""A sentence as `pynmea2` parses it, with an attribute for each of its fields."""
 
 _CHANNELS = {
     "GGA": {"altitude": "altitude", "quality": "gps_qual", "satellites": "num_sats", "hdop": "horizontal_dil"},
@@ -62,10 +66,10 @@ def read_gpx(path: Path, options: Options) -> Log:
     times = np.array([None if p.time is None else _count_micros(p.time) for p in points], dtype="datetime64[us]")
     fields = {"altitude": "elevation", "hdop": "horizontal_dilution"}
     records = [{name: getattr(point, fields.get(name, name), None) for name in GPS_UNITS} for point in points]
-    log = _build_log(path, times, records, options, place="point")
+    log = _build_log(path, times, records, options)
     named = [point for point in gpx.waypoints if point.time and point.name]
     events = [Event(_count_micros(point.time) * 1e-6 - log.offset, "waypoint", point.name) for point in named]
-    return replace(log, events=tuple(events))
+    return replace(log, place="point", events=tuple(events))
 
 
 def read_nmea(path: Path, options: Options) -> Log:
@@ -103,10 +107,10 @@ def read_nmea(path: Path, options: Options) -> Log:
     if damaged:
         figures = {"line": float(damaged[0]), "count": float(len(damaged))}
         issues = (Issue("log: damaged sentences", (str(path), "line"), figures),)
-    return _build_log(path, times, fixes, options, rows=rows, place="line", issues=issues)
+    return replace(_build_log(path, times, fixes, options), rows=rows, place="line", issues=issues)
 
 
-def _parse_sentences(pynmea2: Any, text: str, damaged: list[int]) -> Iterator[tuple[int, Any]]:
+def _parse_sentences(pynmea2: ModuleType, text: str, damaged: list[int]) -> Iterator[tuple[int, Sentence]]:
     """Yield the number of each line and its sentence; lines that are none, or damaged, are listed."""
     for line, raw in enumerate(re.split(r"\r\n|\n|\r", text), start=1):
         start = raw.find("$")  # loggers put times of their own before
@@ -120,7 +124,7 @@ def _parse_sentences(pynmea2: Any, text: str, damaged: list[int]) -> Iterator[tu
             damaged.append(line)
 
 
-def _read_channels(sentence: Any) -> dict[str, float]:
+def _read_channels(sentence: Sentence) -> dict[str, float]:
     """Return the channels that a sentence has; the position only if there is a fix."""
     numbers = {name: _read_float(getattr(sentence, own)) for name, own in _CHANNELS[sentence.sentence_type].items()}
     found = {name: number for name, number in numbers.items() if number is not None}
@@ -133,7 +137,7 @@ def _read_channels(sentence: Any) -> dict[str, float]:
     return found
 
 
-def _has_fix(sentence: Any) -> bool:
+def _has_fix(sentence: Sentence) -> bool:
     if sentence.sentence_type == "GGA":
         return bool(_read_float(sentence.gps_qual))
     if sentence.sentence_type == "GNS":
@@ -141,9 +145,9 @@ def _has_fix(sentence: Any) -> bool:
     return sentence.sentence_type == "RMC" and bool(sentence.status == "A")
 
 
-def _read_float(given: Any) -> float | None:
+def _read_float(given: str | float | None) -> float | None:
     try:
-        return float(given)
+        return None if given is None else float(given)
     except (TypeError, ValueError):
         return None
 
@@ -161,9 +165,9 @@ def _count_micros(moment: datetime) -> int:
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
 
 
-def _build_log(path: Path, times: Any, records: list[dict[str, Any]], options: Options, **more: Any) -> Log:
+def _build_log(path: Path, times: NDArray[Any], records: list[dict[str, Any]], options: Options) -> Log:
     """Return a log of the channels that have a value; its times are stamps of a receiver."""
     columns = {name: np.array([record.get(name) for record in records], dtype=np.float64) for name in GPS_UNITS}
     kept = {name: column for name, column in columns.items() if np.isfinite(column).any()}
     log = build_log(str(path), {"time": times, **kept}, GPS_UNITS | {"time": "s"}, options, zones={"time": "UTC"})
-    return replace(log, has_positions=True, has_dates=False, **more)
+    return replace(log, has_positions=True, has_dates=False)

@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple, overload
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.problem.dates import Dates
@@ -163,7 +163,7 @@ class Log:
     def __getitem__(self, name: str) -> FloatArray: ...
     @overload
     def __getitem__(self, name: list[str] | tuple[str, ...]) -> Log: ...
-    def __getitem__(self, name: Any) -> Any:
+    def __getitem__(self, name: str | Sequence[str]) -> FloatArray | Log:
         if isinstance(name, str):
             return self.values[self.find_channel(name)]
         if isinstance(name, Sequence):
@@ -176,7 +176,7 @@ class Log:
             )
         raise TypeError(f'A log is indexed by a name or a list of names, as in log["x"]; got {shorten(name)}.')
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         """All channels as a (K, q) array."""
         columns = [np.asarray(values, dtype=dtype) for values in self.values.values()]
         return np.stack(columns, axis=1) if columns else np.zeros((len(self), 0))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.io.logs.columns import build_log, find_time_name
 from switchfit.io.logs.log import Log
@@ -17,6 +19,9 @@ from switchfit.problem.validation.messages import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.extras import import_library
 from switchfit.runtime.files import explain_read_errors
+
+MatValue: TypeAlias = Any
+"""What a variable or a field of a struct holds, as SciPy or h5py read it: an array, text, or more structs."""
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 
@@ -70,7 +75,7 @@ def read_mat(path: Path, options: Options) -> Log:
     return build_log(source, columns, units, options._replace(time=key))
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _load(path: Path) -> dict[str, MatValue]:
     with explain_read_errors(path), path.open("rb") as file:
         head = file.read(520)
     with explain_damage(path, "a .mat file"), warnings.catch_warnings():
@@ -86,7 +91,7 @@ def _load(path: Path) -> dict[str, Any]:
     return {name: value for name, value in contents.items() if not name.startswith("__")}
 
 
-def _read_hdf(h5py: Any, item: Any) -> Any:
+def _read_hdf(h5py: ModuleType, item: MatValue) -> MatValue:
     """Return a group as a dict, text as a string, and an array in MATLAB's order of dimensions."""
     if "MATLAB_object_decode" in item.attrs:
         return None  # numbers that stand for an object
@@ -98,7 +103,7 @@ def _read_hdf(h5py: Any, item: Any) -> Any:
     return value
 
 
-def _flatten(group: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten(group: Mapping[str, MatValue], prefix: str = "") -> Iterator[tuple[str, NDArray[Any] | str]]:
     """Yield the arrays and texts in structs, and in arrays of structs, by names with dots."""
     for name, value in group.items():
         if isinstance(value, Mapping):
@@ -109,7 +114,7 @@ def _flatten(group: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield f"{prefix}{name}", value
 
 
-def _find_times(arrays: Mapping[str, Any], time: str | None) -> dict[str, str]:
+def _find_times(arrays: Mapping[str, NDArray[Any] | str], time: str | None) -> dict[str, str]:
     """Return the name of the vector of times in each struct that has one; the file itself is called ""."""
     vectors: dict[str, list[str]] = {}
     for name, value in arrays.items():
@@ -120,16 +125,16 @@ def _find_times(arrays: Mapping[str, Any], time: str | None) -> dict[str, str]:
     return {struct: name for struct, name in found.items() if name is not None}
 
 
-def _is_vector(value: Any) -> bool:
+def _is_vector(value: NDArray[Any] | str) -> bool:
     return isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and 1 < value.size == max(value.shape)
 
 
-def _split_channels(name: str, value: Any, samples: int) -> dict[str, Any]:
+def _split_channels(name: str, value: NDArray[Any] | str, samples: int) -> dict[str, NDArray[Any]]:
     """Return an array with a sample for each time as vectors; nothing for other arrays, and for text."""
-    value = np.squeeze(value)
-    if value.dtype.kind not in "biuf" or samples not in value.shape or value.ndim > 2:
+    array = np.squeeze(np.asarray(value))
+    if array.dtype.kind not in "biuf" or samples not in array.shape or array.ndim > 2:
         return {}
-    if value.ndim == 1:
-        return {name: value}
-    rows = value if value.shape[0] == samples else value.T
+    if array.ndim == 1:
+        return {name: array}
+    rows = array if array.shape[0] == samples else array.T
     return {f"{name}_{k + 1}": rows[:, k] for k in range(rows.shape[1])}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -30,6 +30,14 @@ LONGEST_ARRAY = 36
 """Entries of an array in a message that become channels; longer ones are pictures and scans."""
 
 Record = dict[str, float]
+"""The channels of one message."""
+
+Message: TypeAlias = Any
+"""A message as `rosbags` deserializes it, with an attribute for each field of its type."""
+
+Connection: TypeAlias = Any
+"""Where the messages of one topic and type stand in a bag; `rosbags` has a class of its own for each kind of bag."""
+
 _POSE = ("x", "y", "z", "", "", "yaw")
 
 _TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
@@ -67,13 +75,13 @@ def read_bag(path: Path, options: Options) -> Log:
             return _read_topic(path, reader, options)
 
 
-def _read_topic(path: Path, reader: Any, options: Options) -> Log:
+def _read_topic(path: Path, reader: Connection, options: Options) -> Log:
     connections = _choose_connections(path, reader.connections, options.topic)
     kind, topic = connections[0].msgtype, connections[0].topic
     read = _READERS.get(kind, _flatten)
     start = reader.start_time
 
-    def unpack(connection: Any, time: int, data: bytes) -> tuple[int, int, Record, Event | None]:
+    def unpack(connection: Connection, time: int, data: bytes) -> tuple[int, int, Record, Event | None]:
         message = reader.deserialize(data, connection.msgtype)
         text = getattr(message, "data", None)
         event = Event((time - start) / SECOND, topic, text) if isinstance(text, str) else None
@@ -102,7 +110,7 @@ def _read_topic(path: Path, reader: Any, options: Options) -> Log:
     )
 
 
-def _choose_connections(path: Path, connections: Sequence[Any], topic: str | None) -> list[Any]:
+def _choose_connections(path: Path, connections: Sequence[Connection], topic: str | None) -> list[Connection]:
     """Return the connections of a topic; if none is named, of the only one that is known or has messages."""
     types = {connection.topic: connection.msgtype for connection in connections if connection.msgcount}
     listed = ", ".join(f"{name} ({kind.replace('/msg/', '/')})" for name, kind in sorted(types.items())) or "none"
@@ -117,7 +125,7 @@ def _choose_connections(path: Path, connections: Sequence[Any], topic: str | Non
     return chosen
 
 
-def _read_stamp(message: Any) -> int:
+def _read_stamp(message: Message) -> int:
     """Return the stamp of a header in nanoseconds; 0 without a header."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return 0 if stamp is None else int(stamp.sec) * SECOND + int(stamp.nanosec)
@@ -126,7 +134,7 @@ def _read_stamp(message: Any) -> int:
 # --- types of messages ------------------------------------------------------------------------------------------------
 
 
-def _read_fix(message: Any) -> Record:
+def _read_fix(message: Message) -> Record:
     position = ("latitude", "longitude", "altitude")
     if message.status.status < 0:  # no fix
         return dict.fromkeys(position, np.nan)
@@ -137,7 +145,7 @@ def _read_fix(message: Any) -> Record:
     return found
 
 
-def _read_motion(motion: Any) -> Record:
+def _read_motion(motion: Message) -> Record:
     """Return the channels of a pose or of a twist, and the square roots of variances that are given: 0 is unknown."""
     if hasattr(motion, "covariance"):
         names, inner = (_POSE, motion.pose) if hasattr(motion, "pose") else (_TWIST, motion.twist)
@@ -150,7 +158,7 @@ def _read_motion(motion: Any) -> Record:
     return dict(zip(_TWIST, (v.x, v.y, v.z, w.x, w.y, w.z), strict=True))
 
 
-def _read_imu(message: Any) -> Record:
+def _read_imu(message: Message) -> Record:
     a, w = message.linear_acceleration, message.angular_velocity
     found = {"ax": a.x, "ay": a.y, "az": a.z, "wx": w.x, "wy": w.y, "wz": w.z}
     if message.orientation_covariance[0] != -1:  # -1: it has no orientation
@@ -158,7 +166,7 @@ def _read_imu(message: Any) -> Record:
     return found
 
 
-def _read_joints(message: Any) -> Record:
+def _read_joints(message: Message) -> Record:
     found: Record = {}
     for field in ("position", "velocity", "effort"):
         samples = getattr(message, field)
@@ -167,14 +175,14 @@ def _read_joints(message: Any) -> Record:
     return found
 
 
-def _find_yaw(q: Any) -> float:
+def _find_yaw(q: Message) -> float:
     """Return the angle about the vertical axis of a quaternion; NaN for the zero quaternion, which is no rotation."""
     if q.x == q.y == q.z == q.w == 0.0:
         return np.nan
     return float(np.arctan2(2 * (q.w * q.z + q.x * q.y), q.w**2 + q.x**2 - q.y**2 - q.z**2))
 
 
-def _flatten(message: Any, prefix: str = "") -> Record:
+def _flatten(message: Message, prefix: str = "") -> Record:
     """Return all numbers of a message by their names in it, such as ``"pose.position.x"``; headers are left out."""
     found: Record = {}
     for name in getattr(message, "__dataclass_fields__", ()):
@@ -190,7 +198,7 @@ def _flatten(message: Any, prefix: str = "") -> Record:
     return found
 
 
-_READERS: dict[str, Callable[[Any], Record]] = {
+_READERS: dict[str, Callable[[Message], Record]] = {
     "sensor_msgs/msg/NavSatFix": _read_fix,
     "sensor_msgs/msg/Imu": _read_imu,
     "sensor_msgs/msg/JointState": _read_joints,

@@ -142,7 +142,7 @@ def _read_times(table: TextTable, column: int, options: Options) -> Log:
 
 
 def _read_cells(
-    table: TextTable, column: int, cells: Sequence[str], read: Callable[[str], Any], missing: Any, what: str
+    table: TextTable, column: int, cells: Sequence[str], read: Callable[[str], object], missing: object, what: str
 ) -> list[Any]:
     """Return what a function reads in each cell of a column; raise InputError where that is None."""
     found = [missing if is_missing(cell) else read(cell) for cell in cells]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
+import numpy as np
+
+from switchfit.arrays import FloatArray
 from switchfit.io.logs.log import Log
 from switchfit.problem.time_units import SECONDS_OF_UNIT, TIMEDELTA_OF_UNIT
 
@@ -16,7 +18,7 @@ def convert_time_unit(log: Log, unit: str) -> Log:
         return replace(log, time_unit=unit)
     # A quotient of integers: 40 ms are 0.04 s.
     length, new = (int(TIMEDELTA_OF_UNIT[each] / TIMEDELTA_OF_UNIT["ns"]) for each in (log.time_unit, unit))
-    return _map_times(log, lambda t: t * length / new, offset=log.offset * length / new, time_unit=unit)
+    return _map_times(log, lambda t: t * length / new, log.offset * length / new, unit)
 
 
 def align_starts(logs: Sequence[Log]) -> list[Log]:
@@ -32,10 +34,11 @@ def align_starts(logs: Sequence[Log]) -> list[Log]:
 
 def _shift_start(log: Log, start: float) -> Log:
     shift = log.offset - start / SECONDS_OF_UNIT[log.time_unit]
-    return _map_times(log, lambda t: t + shift, offset=log.offset - shift)
+    return _map_times(log, lambda t: t + shift, log.offset - shift, log.time_unit)
 
 
-def _map_times(log: Log, change: Callable[[Any], Any], **more: Any) -> Log:
-    """Return the log with the times of its samples and its events changed."""
-    events = tuple(event._replace(time=change(event.time)) for event in log.events)
-    return replace(log, times=change(log.times), events=events, **more)
+def _map_times(log: Log, change: Callable[[FloatArray], FloatArray], offset: float, time_unit: str) -> Log:
+    """Return the log with the times of its samples and its events changed, and what says how to read them."""
+    moments = change(np.array([event.time for event in log.events], dtype=np.float64)).tolist()
+    events = tuple(event._replace(time=moment) for event, moment in zip(log.events, moments, strict=True))
+    return replace(log, times=change(log.times), events=events, offset=offset, time_unit=time_unit)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from switchfit.io.problem_file.digests import digest_file, list_files
 from switchfit.io.problem_file.experiments import Runs, build_experiments, load_named_object
@@ -18,6 +18,9 @@ from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.issue import Issue
 from switchfit.strategy.library import build_library
+
+if TYPE_CHECKING:
+    from switchfit.problem.system import HybridSystem
 
 
 @dataclass(frozen=True)
@@ -89,17 +92,15 @@ def build_problem(
 
 def _build_problem(path: Path, contents: Contents, runs: Runs, searched: bool) -> Problem:
     options = contents.options.model_dump(exclude=OPTIONS, exclude_none=True)
-    built: Problem
     if contents.problem is None:
         if searched:  # with room for transitions, a problem may have nothing else to estimate
             counts = (len(run.transition_times) + len(run.jump_times) for run in runs.experiments)
             options["max_transitions"] = max(1, *counts)
         parameters = build_parameters(path, contents)
-        built = build_at(str(path), Problem, runs.system, runs.experiments, parameters, **options)
-    elif options:
+        system = cast("HybridSystem", runs.system)  # a file without 'problem' has a model, and its file has run
+        return build_at(str(path), Problem, system, runs.experiments, parameters, **options)
+    if options:
         raise InputError(
             f"{path}: with 'problem', {', '.join(options)} is set where the sf.Problem is built, not here."
         )
-    else:
-        built = load_named_object(path, "problem", contents.problem, Problem)
-    return built
+    return load_named_object(path, "problem", contents.problem, Problem)

@@ -9,7 +9,7 @@ import reprlib
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import get_args, get_origin
 
 import pydantic
 
@@ -97,7 +97,7 @@ def _follow_location(location: Sequence[str | int]) -> tuple[type[TomlTable], st
     return holder, key, repr(place)
 
 
-def _find_table(annotation: Any) -> type[TomlTable] | None:
+def _find_table(annotation: object) -> type[TomlTable] | None:
     if inspect.isclass(annotation) and issubclass(annotation, TomlTable):
         return annotation
     return next((found for part in get_args(annotation) if (found := _find_table(part)) is not None), None)

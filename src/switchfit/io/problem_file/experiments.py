@@ -8,18 +8,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from switchfit.arrays import FloatArray
 from switchfit.io.logs.log import Log
 from switchfit.io.problem_file import tables
 from switchfit.io.problem_file.logs import Opened
 from switchfit.io.problem_file.parameters import build_parameter
 from switchfit.io.problem_file.samples import cut_log
 from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTable, InputTable, ModelTable
-from switchfit.io.user_files import build_at, call, find_object, load_object
+from switchfit.io.user_files import UserObject, build_at, call, find_object, load_object
 from switchfit.models import BUILT_IN
+from switchfit.problem.dates import Dates
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.inputs import Input
 from switchfit.problem.jump import Jump
@@ -28,6 +30,8 @@ from switchfit.problem.reference_signals import ReferenceSignal
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.issue import Issue
+
+Kind = TypeVar("Kind")
 
 PREFIXES = "pnµmcdhkMGT"
 """Of units that differ by a power of ten."""
@@ -55,7 +59,7 @@ class Runs(NamedTuple):
     system: HybridSystem | None
 
 
-def load_named_object(path: Path, key: str, table: ModelTable, kind: type) -> Any:
+def load_named_object(path: Path, key: str, table: ModelTable, kind: type[Kind]) -> Kind:
     """Return what a key names: something built in, or in a Python file, or what a function there returns."""
     what = f"{path}: {key} {table.name!r}"
     found = BUILT_IN.get(table.name) or load_object(table.name, path.parent, f"{path}: {key}")
@@ -163,10 +167,15 @@ class _Run:
     system: HybridSystem | None
 
     def build(self, logs: Sequence[Log]) -> Experiment:
-        table, built = self.table, {}
+        table = self.table
+        data: list[Measurements | ReferenceSignal] = []
+        inputs: Input | None = None
         for (place, item), log in zip(table.list_logs().items(), logs, strict=True):
-            build = self._build_input if isinstance(item, InputTable) else self._build_data
-            built[place] = build_at(f"{self.where}.{place}", build, place, item, log)
+            where = f"{self.where}.{place}"
+            if isinstance(item, InputTable):
+                inputs = build_at(where, self._build_input, place, item, log)
+            else:
+                data.append(build_at(where, self._build_data, place, item, log))
         times, state = table.transition_times, table.initial_state
         jumps = {f"jumps[{k}]": jump for k, jump in enumerate(table.jumps, start=1)}
         given: dict[str, Any] = table.model_dump(
@@ -175,15 +184,15 @@ class _Run:
         return Experiment(
             **given,
             mode_sequence=tuple(table.mode_sequence or ()),
-            inputs=built.pop("inputs", None),
-            data=list(built.values()),
+            inputs=inputs,
+            data=data,
             transition_times=None if times is None else tuple(map(build_parameter, times)),
             tf=None if table.tf is None else build_parameter(table.tf),  # type: ignore[arg-type]
             initial_state=None if state is None else [e.value if e.fixed else build_parameter(e) for e in state],
             jumps=[build_at(f"{self.where}.{at}", self._build_jump, at, jump) for at, jump in jumps.items()],
         )
 
-    def _load_function(self, place: str, reference: str) -> Any:
+    def _load_function(self, place: str, reference: str) -> UserObject:
         """Return a function of a Python file, or one in its place if that is not to be run."""
         if self.system is not None:
             return load_object(reference, self.folder, f"{self.where}.{place}")
@@ -239,7 +248,7 @@ class _Run:
 
     def _build_input(self, place: str, item: InputTable, log: Log) -> Input:
         times, values, units = cut_log(log, item, self.contents, self.table, "Input")
-        given: Any = times
+        given: FloatArray | Dates | list[float] = times
         if not len(log):  # of a stream, whose inputs hold until others come
             given, values = [self.table.t0 or 0.0], np.zeros((1, len(units)))
         if isinstance(item.columns, dict):

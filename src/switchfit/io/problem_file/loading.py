@@ -9,11 +9,11 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 from switchfit.io.logs.files import find_logs, name_files
 from switchfit.io.problem_file.contents import read_contents
-from switchfit.io.problem_file.tables import Contents, ExperimentTable
+from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTable, InputTable
 from switchfit.io.user_files import build_at, find_object
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
     from switchfit.io.problem_file.experiments import Runs
     from switchfit.io.problem_file.logs import Opened
+
+NamesLog = TypeVar("NamesLog", DataTable, InputTable)
 
 
 def load_problem(
@@ -151,7 +153,7 @@ def _expand_patterns(folder: Path, table: ExperimentTable) -> list[ExperimentTab
 def _replace_files(table: ExperimentTable, files: Mapping[str | None, str], name: str | None) -> ExperimentTable:
     """Return an experiment with other files in place of some."""
 
-    def replace(item: Any) -> Any:
+    def replace(item: NamesLog) -> NamesLog:
         return item.model_copy(update={"file": files.get(item.file, item.file)})
 
     inputs = None if table.inputs is None else replace(table.inputs)

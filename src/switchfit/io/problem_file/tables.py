@@ -67,7 +67,7 @@ def describe_keys(kind: type[TomlTable]) -> dict[str, str]:
     return found
 
 
-def is_date(given: Any) -> bool:
+def is_date(given: object) -> bool:
     """Return whether a value is a date: one of TOML's own, or text in ISO 8601.
 
     Parameters
@@ -82,7 +82,7 @@ def is_date(given: Any) -> bool:
     return read_date_text(given) is not None
 
 
-def _check_time(given: Any) -> Any:
+def _check_time(given: object) -> object:
     """Return a number or a date."""
     if isinstance(given, (int, float)) and not isinstance(given, bool):
         return float(given)
@@ -93,7 +93,7 @@ def _check_time(given: Any) -> Any:
     raise PydanticCustomError("time_type", f"Input should be a number or a date such as {EXAMPLES}")
 
 
-def _wrap(key: str, **more: Any) -> BeforeValidator:
+def _wrap(key: str, **more: object) -> BeforeValidator:
     """Return a validator that makes a table with one key, and more, of anything that is no table."""
     return BeforeValidator(lambda given: given if isinstance(given, dict) else {key: given, **more})
 

@@ -8,7 +8,7 @@ into the sources by their names. Colours that have to change with the reader's l
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from bokeh import models
@@ -19,6 +19,13 @@ from switchfit.report.html.curves import Columns, Curves
 from switchfit.report.numbers import label_quantity
 from switchfit.report.plane import find_plane
 from switchfit.report.times import Timed, describe_clock, label_time
+
+Plot: TypeAlias = Any
+"""A `bokeh.plotting.figure`. Bokeh's annotations know neither the tags of what is drawn, nor that an axis has the kinds
+of label and ticker that it is given here."""
+
+Renderer: TypeAlias = Any
+"""What has drawn a curve into a `Plot`, which a tool for the pointer asks for."""
 
 PAGE_FIT_COLOUR, PAGE_DATA_COLOUR = "#d0392b", "#5b6470"
 """Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
@@ -45,7 +52,7 @@ DOT_SIZES = {150: 6.0, 600: 4.0, np.inf: 2.5}
 LABELS = {"measurements": "measured", "reference": "reference"}
 
 
-def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: Timed) -> Any:
+def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: Timed) -> models.Column:
     """Return the figures of one run below one another: each channel with its residuals, and the path in the plane.
 
     Parameters
@@ -92,7 +99,7 @@ def make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
     return models.ColumnDataSource({key: [] for own in columns for key in (own, f"fit_{own}")}, name=name)
 
 
-def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
+def _make_figure(height: int, x: str, y: str, **settings: Any) -> Plot:
     """Return an empty figure with the labels of its axes."""
     frame: dict[str, Any] = {
         "sizing_mode": "stretch_width",
@@ -109,7 +116,7 @@ def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
 
 def _make_time_figure(
     height: int, times: models.Range1d, label: str, sources: Mapping[str, models.ColumnDataSource], run: Timed
-) -> Any:
+) -> Plot:
     """Return a figure over time with the modes shaded, and the transition times in their intervals."""
     plot = _make_figure(height, "", label, x_range=times)
     plot.xgrid.visible = False
@@ -130,14 +137,14 @@ def _make_time_figure(
     return plot
 
 
-def _put_legend_above(plot: Any) -> None:
+def _put_legend_above(plot: Plot) -> None:
     """Move the legend out of the way of the data; a click on an entry hides what it stands for."""
     plot.legend.click_policy = "hide"
     plot.legend.orientation = "horizontal"
     plot.add_layout(plot.legend[0], "above")
 
 
-def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed | None = None) -> None:
+def _add_hover(plot: Plot, renderer: Renderer, tips: Sequence[tuple[str, str]], run: Timed | None = None) -> None:
     """Show (label, column) under the pointer, and the time of a run before them.
 
     Bokeh escapes what is in columns, but neither labels nor units.
@@ -153,7 +160,7 @@ def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: T
     plot.add_tools(tool)
 
 
-def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> Any:
+def _draw_curve(plot: Plot, curves: Curves, k: int, source: models.ColumnDataSource) -> Renderer:
     """Draw what is fitted: its band, the fit itself that is shown once something has been moved; return what moves."""
     if "lo0" in curves.curve:
         band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
@@ -164,8 +171,8 @@ def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSour
 
 
 def _draw_measured(
-    plot: Any, curves: Curves, x: str, y: str, source: models.ColumnDataSource, *, scale: float = 1.0, **legend: Any
-) -> Any:
+    plot: Plot, curves: Curves, x: str, y: str, source: models.ColumnDataSource, *, scale: float = 1.0, **legend: Any
+) -> Renderer:
     """Draw what is measured as dots, or a reference signal as a dashed line."""
     if curves.kind == "reference":
         return plot.line(x, y, source=source, line_width=1.6, tags=["ink"], **DASHED_LOOK, **legend)
@@ -173,7 +180,7 @@ def _draw_measured(
     return plot.scatter(x, y, source=source, size=scale * size, **DOT_LOOK, **legend)
 
 
-def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
+def _draw_samples(plot: Plot, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
     drawn = _draw_measured(plot, curves, "t", f"m{k}", source, legend_label=LABELS[curves.kind])
     if "o0" in curves.samples:
         label = "weighed down"
@@ -184,7 +191,7 @@ def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSo
     _add_hover(plot, drawn, tips, run)
 
 
-def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
+def _draw_residuals(plot: Plot, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
     plot.hspan(y=0.0, line_color=PAGE_FIT_COLOUR, line_width=1)
     for side in ("s", "n") if "s0" in curves.samples else ():
         plot.line("t", f"{side}{k}", source=source, line_color=PAGE_DATA_COLOUR, line_dash="dotted", tags=["muted"])
@@ -193,7 +200,7 @@ def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnData
 
 def _draw_path(
     curves: Curves, plane: tuple[int, int], curve: models.ColumnDataSource, samples: models.ColumnDataSource
-) -> Any:
+) -> Plot:
     """Draw two positions against one another, with the transitions on the fitted path."""
     x, y = plane
     labels = [label_quantity(curves.names[k], curves.units[k]) for k in plane]
@@ -212,7 +219,7 @@ def _draw_path(
     return plot
 
 
-def draw_slice() -> Any:
+def draw_slice() -> Plot:
     """Return an empty figure of the rise of J along one unknown; the page's script fills it."""
     plot = _make_figure(SLICE_HEIGHT, "", "rise of J")
     plot.xaxis.axis_label.name = "slice-label"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from html import escape
-from typing import Any
+from typing import Literal
 
 from switchfit.batch.fits import Fits
 from switchfit.problem.problem import Problem
@@ -23,7 +23,7 @@ MOST_PANELS_IN_NOTEBOOK = 4
 @format_html.register(Problem)
 @format_html.register(Prediction)
 @format_html.register(Displayed)
-def show_result(result: Any) -> str:
+def show_result(result: object) -> str:
     """Return the text of a result, and its figure if it has a small one.
 
     Parameters
@@ -31,7 +31,7 @@ def show_result(result: Any) -> str:
     result : object
     """
     is_forecast = isinstance(result, Prediction)
-    size = len(result.output_names if is_forecast else getattr(result, "trajectories", ()))
+    size = len(getattr(result, "output_names" if is_forecast else "trajectories", ()))
     is_empty = (is_forecast and not size) or (isinstance(result, Fits) and not len(result))
     image = ""
     if hasattr(result, "plot") and not is_empty and size <= MOST_PANELS_IN_NOTEBOOK:
@@ -41,15 +41,15 @@ def show_result(result: Any) -> str:
     return f"<div><pre>{escape(text)}</pre>{image}</div>"
 
 
-def embed_figure(figure: Figure, **settings: Any) -> str:
+def embed_figure(figure: Figure, *, dpi: float | Literal["figure"] = "figure", transparent: bool = False) -> str:
     """Return a figure as the source of an image.
 
     Parameters
     ----------
     figure : matplotlib.figure.Figure
-    settings
-        Of ``Figure.savefig``.
+    dpi, transparent
+        As of ``Figure.savefig``.
     """
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", **settings)
+    figure.savefig(picture, format="png", dpi=dpi, transparent=transparent)
     return f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"

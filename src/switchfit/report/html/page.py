@@ -14,6 +14,7 @@ from bokeh.core.serialization import Serializer
 from bokeh.embed import json_item
 from bokeh.resources import Resources
 
+from switchfit.arrays import FloatArray
 from switchfit.estimation.estimates import Estimate
 from switchfit.fit.result import Fit
 from switchfit.io.provenance import Provenance
@@ -127,7 +128,8 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
     for slider in sliders:
         slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]
     derivatives = {"gradient": estimate.gradient[moved], "hessian": estimate.hessian[np.ix_(moved, moved)]}
-    costs = {name: drop_nan(value) for name, value in {"cost": estimate.cost, **derivatives}.items()}
+    values: dict[str, float | FloatArray] = {"cost": estimate.cost, **derivatives}
+    costs = {name: drop_nan(value) for name, value in values.items()}
     payload = {"templates": templates, "runs": figures, "sliders": sliders, **costs}
     return [_describe_run(estimate, e, curves[e], colours) for e in order], payload
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
 from switchfit.estimation.estimates import Estimate
@@ -55,7 +56,7 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
     return found
 
 
-def drop_nan(values: Any) -> Any:
+def drop_nan(values: ArrayLike) -> object:
     """Return a number or an array for JSON, with None for what is not finite."""
     return np.where(np.isfinite(values), values, np.array(None)).tolist()
 
