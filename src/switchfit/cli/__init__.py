@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["build_app", "main"]
+__all__ = ["main"]
 
 YOUNG_OBJECTS = 200_000
 """New objects after which Python looks for garbage. With its own threshold of 700, a tenth of the processor time of a
@@ -36,13 +36,8 @@ COMMANDS = {
 """Commands and their modules, in the order of --help."""
 
 
-def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """Return the command line with some commands, whose modules are imported.
-
-    Parameters
-    ----------
-    names : iterable of str
-    """
+def _build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
+    """Return the command line with some commands, whose modules are imported."""
     app = typer.Typer(
         name="switchfit",
         help="""When did it switch, and what were the parameters? Fits switched models to logs.
@@ -85,7 +80,7 @@ def main() -> None:
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     asked = [name for name in sys.argv[1:2] if name in COMMANDS]
     try:
-        build_app(asked or COMMANDS)(prog_name="switchfit")
+        _build_app(asked or COMMANDS)(prog_name="switchfit")
     finally:
         gc.freeze()  # else Python searches all that is imported for garbage when it exits: 20 to 80 ms
 
@@ -94,4 +89,4 @@ def __getattr__(name: str) -> object:
     """Return the whole command line as ``app``, built when it is first used (PEP 562)."""
     if name != "app":
         raise AttributeError(f"module 'switchfit.cli' has no attribute {name!r}", name=name)
-    return globals().setdefault(name, build_app())
+    return globals().setdefault(name, _build_app())

@@ -58,7 +58,7 @@ class LivePage:
         self.page = page.replace("/* report.css */", css)
         self._state: tuple[int, tuple[str, ...]] = (0, ())
         try:
-            self._server = ThreadingHTTPServer((ADDRESS, port), make_handler(self))
+            self._server = ThreadingHTTPServer((ADDRESS, port), _make_handler(self))
         except (OSError, OverflowError) as error:
             raise InputError(f"the page cannot be served on port {port}: {error}; name another with --live.") from error
         self._server.daemon_threads = True
@@ -88,7 +88,7 @@ class LivePage:
         threading.Event().wait()
 
 
-def make_handler(live: LivePage) -> type[BaseHTTPRequestHandler]:
+def _make_handler(live: LivePage) -> type[BaseHTTPRequestHandler]:
     """Return the class that answers requests."""
 
     class Handler(BaseHTTPRequestHandler):

@@ -18,7 +18,7 @@ from switchfit.runtime.errors import InputError
 # --- saved estimates, whose problem is built again from what they were made from --------------------------------------
 
 
-def rebuild_problem(
+def _rebuild_problem(
     path: Path, given: Provenance | None, folder: Path | None = None, log: Path | None = None
 ) -> ProblemFile:
     """Return the problem of a saved estimate, built from the text that was saved with it.
@@ -74,11 +74,11 @@ def load_other_run(path: Path, given: Provenance | None, other: Path, folder: Pa
     other : Path
         A problem file, whose name ends in .toml, or a log.
     folder : Path or None
-        As in `rebuild_problem`.
+        Where the files are; left out, where the problem file was, seen from the folder of the saved estimate.
     """
     if other.suffix.lower() == ".toml":
         return load_problem(other)
-    return rebuild_problem(path, given, folder, other)
+    return _rebuild_problem(path, given, folder, other)
 
 
 def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate, list[str]]:
@@ -89,7 +89,7 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
     path : Path
         Of the saved estimate.
     folder : Path, optional
-        As in `rebuild_problem`.
+        Where the files are; left out, where the problem file was, seen from the folder of the saved estimate.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
         If the problem cannot be built again, or its data are no longer those that were fitted.
     """
     given = Estimate.load(path).provenance
-    loaded = rebuild_problem(path, given, folder)
+    loaded = _rebuild_problem(path, given, folder)
     estimate = Estimate.load(path, problem=loaded.problem)
     if not _has_data(estimate, loaded.problem):
         raise InputError(

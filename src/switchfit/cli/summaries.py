@@ -54,7 +54,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         "fixed": {name: estimate.parameters[name] for name in estimate.fixed},
         "runs": [
             {
-                **summarize_run(run, trajectory),
+                **_summarize_run(run, trajectory),
                 "channels": [
                     {"name": name, "samples": int(np.isfinite(c.measured[:, k]).sum()), "rmse": c.rmse[k]}
                     for c in comparisons
@@ -82,14 +82,8 @@ def _summarize_verdict(verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
-    """Return the modes of a run and the times of its jumps.
-
-    Parameters
-    ----------
-    name : str
-    trajectory : Trajectory
-    """
+def _summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
+    """Return the modes of a run and the times of its jumps."""
     modes: list[dict[str, Any]] = [
         dict(zip(("mode", "begin", "end"), span, strict=True)) for span in trajectory.mode_spans
     ]
@@ -131,7 +125,7 @@ def summarize_validation(found: Validation) -> dict[str, Any]:
             for name, percent in found.channels.items()
         ],
         "inputs": [test._asdict() for test in found.inputs],
-        "runs": [summarize_run(*named) for named in zip(found.run_names, found.trajectories, strict=True)],
+        "runs": [_summarize_run(*named) for named in zip(found.run_names, found.trajectories, strict=True)],
     }
 
 

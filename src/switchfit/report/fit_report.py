@@ -59,7 +59,7 @@ def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
         "Held fixed": format_table(*tabulate_fixed(estimate), most=limits["fixed"]),
         f"Correlations above {SMALL_CORRELATION:g}": correlations,
         "Determined worst by the data": _describe_weak(estimate, limits["directions"]),
-        "Warnings": _list_sentences(list_warnings(estimate), limits["others"], "warning"),
+        "Warnings": _list_sentences(_list_warnings(estimate), limits["others"], "warning"),
     }
     written = [[title, *lines] for title, lines in sections.items() if lines]
     shown = tables.join_sections(wrap_text(str(estimate.verdict)), *written)
@@ -80,13 +80,8 @@ def _list_sentences(sentences: Sequence[str], most: int, what: str) -> list[str]
     return lines + ([f"  and {format_count(more, what)} more"] if more else [])
 
 
-def list_warnings(estimate: Estimate) -> list[str]:
-    """Return the warnings that the verdict does not cover, as sentences.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    """
+def _list_warnings(estimate: Estimate) -> list[str]:
+    """Return the warnings that the verdict does not cover, as sentences."""
     reasons = {reason.kind for reason in estimate.verdict.reasons}
     covered = reasons.union(*(_COVERED.get(kind, set()) for kind in reasons))
     return [str(issue) for issue in find_issues(estimate) if issue.kind not in covered]

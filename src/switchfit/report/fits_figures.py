@@ -45,17 +45,17 @@ def plot_fits(fits: Fits) -> Figure:
     shown, width, height, most, title = list(range(len(fits.theta_names))), 3.4, 2.7, 3, ""
     draw: Callable[[int, Axes], None]
     if isinstance(fits, Bootstrap):
-        draw = partial(draw_bootstrap, fits)
+        draw = partial(_draw_bootstrap, fits)
         shown, title = np.flatnonzero(fits.resampled).tolist(), f"Bootstrap: {fits.resample}"
     elif isinstance(fits, MonteCarlo):
         failed = int((~fits.success).sum())
         draw, title = (
-            partial(draw_monte_carlo, fits),
+            partial(_draw_monte_carlo, fits),
             f"{failed} runs that did not converge are left out" if failed else "",
         )
     else:
         order = fits.worst_first[:DRAWN_FITS]
-        draw, title = partial(draw_rows, fits, order=order), selection.count_worst(order, fits, "fits")
+        draw, title = partial(_draw_rows, fits, order=order), selection.count_worst(order, fits, "fits")
         width, height, most = 2.9, 0.9 + 0.2 * max(len(order), 5), DRAWN_UNKNOWNS
         shown = select_unknowns_of_fits(fits, DRAWN_UNKNOWNS)
     if isinstance(fits, MonteCarlo | Bootstrap) and fits.success.sum() < 2:
@@ -73,18 +73,8 @@ def plot_fits(fits: Fits) -> Figure:
     return style.turn_off_formulas(figure)
 
 
-def draw_rows(fits: Fits, k: int, ax: Axes, *, order: NDArray[np.intp]) -> None:
-    """Draw one unknown with its 95 % intervals, a row for each of the given fits, the first on top.
-
-    Parameters
-    ----------
-    fits : Fits
-    k : int, from 0
-        Which unknown.
-    ax : matplotlib.axes.Axes
-    order : int array
-        Places of the fits that are drawn.
-    """
+def _draw_rows(fits: Fits, k: int, ax: Axes, *, order: NDArray[np.intp]) -> None:
+    """Draw one unknown with its 95 % intervals, a row for each of the given fits, the first on top."""
     rows, intervals, levels = np.arange(len(order)), fits.confidence_intervals()[order, k], fits.levels[order]
     for level, colour in LEVEL_COLOURS.items():
         here = levels == level
@@ -105,32 +95,16 @@ def draw_rows(fits: Fits, k: int, ax: Axes, *, order: NDArray[np.intp]) -> None:
     _label_axis(fits, k, ax)
 
 
-def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> None:
-    """Draw the histogram of one unknown: estimates of the resampled data, the estimate, its 95 % interval.
-
-    Parameters
-    ----------
-    study : Bootstrap
-    k : int, from 0
-        Which unknown.
-    ax : matplotlib.axes.Axes
-    """
+def _draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> None:
+    """Draw the histogram of one unknown: estimates of the resampled data, the estimate, its 95 % interval."""
     _draw_histogram(study, k, study.estimate[k], ax)
     ax.axvline(study.estimate[k], color=FIT_COLOUR, linewidth=LINE, label="estimate")
     for side, edge in enumerate(study.intervals()[k]):
         ax.axvline(edge, color=DATA_COLOUR, linestyle=":", linewidth=LINE, label="" if side else "95 % interval (BCa)")
 
 
-def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> None:
-    """Draw the histogram of one unknown: estimates, truth, the normal density of the reported standard error.
-
-    Parameters
-    ----------
-    study : MonteCarlo
-    k : int, from 0
-        Which unknown.
-    ax : matplotlib.axes.Axes
-    """
+def _draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> None:
+    """Draw the histogram of one unknown: estimates, truth, the normal density of the reported standard error."""
     _draw_histogram(study, k, study.truth[k], ax, density=True)
     error = float(np.median(study.standard_errors[study.success, k]))
     if np.isfinite(error) and error > 0:

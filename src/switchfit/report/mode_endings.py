@@ -65,13 +65,8 @@ _WARNINGS = {
 }
 
 
-def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
-    """Return mode sequences in one line.
-
-    Parameters
-    ----------
-    sequences : sequence of sequences of str, one for each experiment
-    """
+def _join_sequence(sequences: Sequence[Sequence[str]]) -> str:
+    """Return mode sequences in one line."""
     return " | ".join(" -> ".join(modes) for modes in sequences)
 
 
@@ -113,8 +108,8 @@ def write_ending(ending: ModeEnding) -> str:
     ending : ModeEnding
     """
     fields = vars(ending) | {
-        "best": join_sequence(ending.sequences),
-        "other": join_sequence(ending.other),
+        "best": _join_sequence(ending.sequences),
+        "other": _join_sequence(ending.other),
         "criterion": name_criterion(ending.criterion),
         "other_criterion": name_criterion(ending.prefers_other),
         "compared": name_criterion("mbic" if ending.criterion == "bic" else ending.criterion),

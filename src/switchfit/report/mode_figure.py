@@ -36,7 +36,7 @@ def plot_search(search: ModeSearch) -> Figure:
     runs = range(0 if best is None else min(len(search.run_names), DRAWN_RUNS))
     figure = style.make_figure(8.0, 2.8 + 4.2 * max(len(runs), 1 if search.chosen else 0))
     axes = figure.subplots(1 + 2 * len(runs), 1, squeeze=False, height_ratios=[1.0, *([1.2, 0.6] * len(runs))])[:, 0]
-    plot_numbers(search, axes[0])
+    _plot_numbers(search, axes[0])
     colours = style.assign_colours(search.modes, MODE_COLOURS)
     for e, above, below in zip(runs, axes[1::2], axes[2::2], strict=True):
         if best is None:
@@ -50,14 +50,8 @@ def plot_search(search: ModeSearch) -> Figure:
     return style.turn_off_formulas(figure)
 
 
-def plot_numbers(search: ModeSearch, ax: Axes) -> None:
-    """Draw the criteria over the number of switches, each less its lowest.
-
-    Parameters
-    ----------
-    search : ModeSearch
-    ax : matplotlib.axes.Axes
-    """
+def _plot_numbers(search: ModeSearch, ax: Axes) -> None:
+    """Draw the criteria over the number of switches, each less its lowest."""
     numbers = [fit.switches for fit in search.fitted]
     colours = style.assign_colours([*CRITERION_TITLES, "criterion"], LINE_COLOURS)
     for name, label in list_criteria(search).items():

@@ -55,10 +55,10 @@ def write_search(search: ModeSearch) -> str:
         return "\n".join(head)
     head += [line for warning in search.warnings for line in wrap_text(str(warning), "- ", "  ")]
     corrected = fit is not None and not np.array_equal(correct_errors(fit), fit.standard_errors, equal_nan=True)
-    best = list_segments(search), list_parameters(search), [ALLOWED] if corrected else []
-    alternatives = list_alternatives(search) if len(search.chosen) > 1 else []
+    best = _list_segments(search), _list_parameters(search), [ALLOWED] if corrected else []
+    alternatives = _list_alternatives(search) if len(search.chosen) > 1 else []
     effort = f"{format_count(search.fits, 'fit')}, {search.evaluations} evaluations, {search.seconds:.1f} s"
-    return tables.join_sections(head, *best, tabulate_numbers(search), alternatives, [effort])
+    return tables.join_sections(head, *best, _tabulate_numbers(search), alternatives, [effort])
 
 
 def tabulate_segments(
@@ -73,7 +73,7 @@ def tabulate_segments(
     return Table(list(zip(modes, shown[:-1], spreads, shown[1:], strict=True)), "<>>>", titles)
 
 
-def list_segments(search: ModeSearch) -> list[str]:
+def _list_segments(search: ModeSearch) -> list[str]:
     """Return a line for each segment of the best: mode, from, to, and the standard error of where it begins."""
     best, fit, lines = search.chosen[0], search.best, []
     errors = np.append([] if fit is None else correct_errors(fit), np.nan)  # the last: not estimated
@@ -86,7 +86,7 @@ def list_segments(search: ModeSearch) -> list[str]:
     return lines
 
 
-def list_parameters(search: ModeSearch) -> list[str]:
+def _list_parameters(search: ModeSearch) -> list[str]:
     """Return a line for each estimated parameter and initial state of the best."""
     best, fit, rows = search.chosen[0], search.best, []
     for name, value, acts in zip(search.parameter_names, best.parameters, best.acting, strict=True):
@@ -99,7 +99,7 @@ def list_parameters(search: ModeSearch) -> list[str]:
     return format_table(rows, "<><")
 
 
-def tabulate_numbers(search: ModeSearch) -> list[str]:
+def _tabulate_numbers(search: ModeSearch) -> list[str]:
     """Return a row for each number of switches: J, the criteria, and the best sequence."""
     criteria, rows = list_criteria(search), []
     for fit in search.fitted:
@@ -112,7 +112,7 @@ def tabulate_numbers(search: ModeSearch) -> list[str]:
     return _format_sequences(search, rows, "<" + ">" * (len(titles) - 1), titles, "sequence")
 
 
-def list_alternatives(search: ModeSearch) -> list[str]:
+def _list_alternatives(search: ModeSearch) -> list[str]:
     """Return a line for each alternative: its weight, its criterion less the lowest, and its sequence."""
     criteria = list_criteria(search)
     name = "criterion" if "criterion" in criteria else "aicc" if search.criterion == "aicc" else "mbic"

@@ -27,20 +27,15 @@ def write_comparison(found: ModelComparison) -> str:
     ----------
     found : ModelComparison
     """
-    lines = format_table(*tabulate_models(found))
+    lines = format_table(*_tabulate_models(found))
     ended = [name for name, fit in zip(found.names, found.estimates, strict=True) if not fit.status.successful]
     if ended:
         lines += wrap_text(f"Not converged: {', '.join(ended)}. Likelihoods of these may be too small.", "  ")
-    return join_sections(wrap_text(write_best(found)), lines)
+    return join_sections(wrap_text(_write_best(found)), lines)
 
 
-def write_best(found: ModelComparison) -> str:
-    """Return which model has the smallest BIC and how strong that evidence is, or which models are equally good.
-
-    Parameters
-    ----------
-    found : ModelComparison
-    """
+def _write_best(found: ModelComparison) -> str:
+    """Return which model has the smallest BIC and how strong that evidence is, or which models are equally good."""
     order = _list_best_first(found)
     best = [k for k in order if found.delta_bic[k] < EQUAL_BIC_DIFFERENCE]
     are_best = "has the smallest BIC" if len(best) == 1 else "are as good as each other by BIC"
@@ -52,13 +47,8 @@ def write_best(found: ModelComparison) -> str:
     return f"{text}. {found.values} values."
 
 
-def tabulate_models(found: ModelComparison) -> Table:
-    """Return a row for each model: unknowns, likelihood, AICc and BIC, the best first.
-
-    Parameters
-    ----------
-    found : ModelComparison
-    """
+def _tabulate_models(found: ModelComparison) -> Table:
+    """Return a row for each model: unknowns, likelihood, AICc and BIC, the best first."""
     rows, titles = [], ["", "unknowns", "log L", "AICc", "delta AICc", "weight", "BIC", "delta BIC"]
     for k in _list_best_first(found):
         aicc = [f"{found.aicc[k]:.2f}", f"{found.delta_aicc[k]:.2f}", f"{found.weights[k]:.2g}"]

@@ -115,7 +115,7 @@ def plot_log(log: OnlineLog) -> Figure:
     reach = QUANTILE * now.time_errors
     ends = np.stack([now.transition_times - reach, now.transition_times + reach], axis=1)
     panels.plot_transitions(now.transition_times, ends, axes[0])
-    plot_statistic(log, axes[1])
+    _plot_statistic(log, axes[1])
     for ax, (name, unit, value, error) in zip(axes[2:], values, strict=True):
         _plot_value(log.times, value, error, ax)
         ax.set_ylabel(numbers.wrap_quantity(name, unit))
@@ -125,14 +125,8 @@ def plot_log(log: OnlineLog) -> Figure:
     return style.turn_off_formulas(figure)
 
 
-def plot_statistic(log: OnlineLog, ax: Axes) -> None:
-    """Draw the statistic with its threshold, and a dot for each alarm, an empty one if it was retracted.
-
-    Parameters
-    ----------
-    log : OnlineLog
-    ax : matplotlib.axes.Axes
-    """
+def _plot_statistic(log: OnlineLog, ax: Axes) -> None:
+    """Draw the statistic with its threshold, and a dot for each alarm, an empty one if it was retracted."""
     ax.plot(log.times, np.maximum(log.statistic, 0.0), "-", color=SHADE_COLOUR, linewidth=THIN)
     for alarm in log.alarms:
         face = "none" if alarm in log.retracted else FIT_COLOUR

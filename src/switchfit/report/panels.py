@@ -51,7 +51,7 @@ def plot_comparison(comparison: Comparison, channel: int, ax: Axes, *, label: st
     measured = replace_infinities(comparison.measured[:, channel])
     draw_measured(comparison, comparison.times, measured, ax)
     _mark_outliers(comparison, measured, channel, ax)
-    times, curve = break_at_transitions(comparison.curve_times, replace_infinities(comparison.curve[:, channel]))
+    times, curve = _break_at_transitions(comparison.curve_times, replace_infinities(comparison.curve[:, channel]))
     ax.plot(times, curve, "-", color=FIT_COLOUR, linewidth=LINE, label=label, zorder=4)
     ax.set_ylabel(wrap_quantity(comparison.names[channel], comparison.units[channel]))
 
@@ -203,7 +203,7 @@ def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, la
         For the legend.
     """
     if np.isfinite(band).any():
-        times, low, high = break_at_transitions(times, *band.T)
+        times, low, high = _break_at_transitions(times, *band.T)
         ax.fill_between(times, low, high, color=FIT_COLOUR, alpha=alpha, linewidth=0, zorder=2, label=label)
 
 
@@ -245,14 +245,7 @@ def replace_infinities(values: FloatArray) -> FloatArray:
     return np.where(np.abs(values) < LARGEST_DRAWN, values, np.nan)
 
 
-def break_at_transitions(times: FloatArray, *values: FloatArray) -> list[FloatArray]:
-    """Return times and values with a gap at each transition, whose time stands there twice: curves may jump there.
-
-    Parameters
-    ----------
-    times : (L,)
-        In order.
-    values : (L,) each
-    """
+def _break_at_transitions(times: FloatArray, *values: FloatArray) -> list[FloatArray]:
+    """Return times and values with a gap at each transition, whose time stands there twice: curves may jump there."""
     inner = np.flatnonzero(np.diff(times) == 0) + 1
     return [np.insert(times, inner, times[inner]), *(np.insert(each, inner, np.nan) for each in values)]

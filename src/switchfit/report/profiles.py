@@ -61,7 +61,7 @@ def write_profile(profile: Profile) -> str:
         f"  points, fits          {len(profile.values)}, {profile.fits}",
     ]
     lines += [f"  times                 {times.describe_origin(run)}"] if run is not None else []
-    return "\n".join([*lines, *(f"  - {note}" for note in list_profile_notes(profile))])
+    return "\n".join([*lines, *(f"  - {note}" for note in _list_profile_notes(profile))])
 
 
 def _find_run(profile: Profile) -> Timed | None:
@@ -69,13 +69,8 @@ def _find_run(profile: Profile) -> Timed | None:
     return times.list_dated(profile.fit)[profile.fit.theta_names.index(profile.name)]
 
 
-def list_profile_notes(profile: Profile) -> Iterator[str]:
-    """Yield what limits the interpretation of a profile, a sentence each.
-
-    Parameters
-    ----------
-    profile : Profile
-    """
+def _list_profile_notes(profile: Profile) -> Iterator[str]:
+    """Yield what limits the interpretation of a profile, a sentence each."""
     run, (low, high) = _find_run(profile), profile.interval()
     show, unit = partial(format_time, run=run), "" if run is not None else unit_suffix(profile.unit)
     limits, outermost = profile.limits.values(), profile.values[[0, -1]]

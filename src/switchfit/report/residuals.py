@@ -73,7 +73,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = MOST_DRAWN_CH
     figure.suptitle(selection.count_worst(shown, diagnostics.channels, "channels"), fontsize="medium")
     axes = figure.subplots(len(shown), 3, squeeze=False, width_ratios=[2.0, 1.2, 1.0])
     for row, (label, channel) in zip(axes, shown, strict=True):
-        for ax, draw in zip(row, (draw_in_time, draw_autocorrelation, draw_quantiles), strict=True):
+        for ax, draw in zip(row, (_draw_in_time, _draw_autocorrelation, _draw_quantiles), strict=True):
             draw(channel, ax)
         row[0].set_ylabel(f"{numbers.wrap_quantity(label)}\nresidual / {'sigma' if channel.sigma_known else 'rms'}")
     for ax, title in zip(axes[0], ("Residuals in time", "Autocorrelation", "Quantiles"), strict=True):
@@ -83,14 +83,8 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = MOST_DRAWN_CH
     return style.turn_off_formulas(figure)
 
 
-def draw_in_time(channel: ChannelResiduals, ax: Axes) -> None:
-    """Draw standardised residuals over time with lines at two standard deviations.
-
-    Parameters
-    ----------
-    channel : ChannelResiduals
-    ax : matplotlib.axes.Axes
-    """
+def _draw_in_time(channel: ChannelResiduals, ax: Axes) -> None:
+    """Draw standardised residuals over time with lines at two standard deviations."""
     ax.axhline(0.0, color=FIT_COLOUR, linewidth=THIN)
     for side in (-2.0, 2.0):
         ax.axhline(side, color=TRANSITION_COLOUR, linewidth=THIN, linestyle=":")
@@ -99,14 +93,8 @@ def draw_in_time(channel: ChannelResiduals, ax: Axes) -> None:
     style.label_axis(ax, channel)
 
 
-def draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> None:
-    """Draw the autocorrelation against lag, with the limits within which that of white noise lies in 95 %.
-
-    Parameters
-    ----------
-    channel : ChannelResiduals
-    ax : matplotlib.axes.Axes
-    """
+def _draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> None:
+    """Draw the autocorrelation against lag, with the limits within which that of white noise lies in 95 %."""
     limit = 1.96 / np.sqrt(max(len(channel.values), 1))
     ax.axhspan(-limit, limit, color=SHADE_COLOUR, alpha=0.15, linewidth=0)
     ax.axhline(0.0, color=TRANSITION_COLOUR, linewidth=THIN)
@@ -117,14 +105,8 @@ def draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> None:
     ax.set_ylim(-min(reach, 1.05), min(reach, 1.05))
 
 
-def draw_quantiles(channel: ChannelResiduals, ax: Axes) -> None:
-    """Draw sorted standardised residuals against the quantiles of the normal distribution: a straight line if normal.
-
-    Parameters
-    ----------
-    channel : ChannelResiduals
-    ax : matplotlib.axes.Axes
-    """
+def _draw_quantiles(channel: ChannelResiduals, ax: Axes) -> None:
+    """Draw sorted standardised residuals against the quantiles of the normal distribution: a straight line if normal."""
     n = len(channel.values)
     expected = special.ndtri((np.arange(1, n + 1) - 0.5) / n)
     ax.plot(expected[[0, -1]], expected[[0, -1]], "-", color=FIT_COLOUR, linewidth=THIN)

@@ -37,7 +37,7 @@ def write_validation(found: Validation) -> str:
     sections = [wrap_text(str(found.verdict)), format_table(rows, "<>><<")]
     if not np.array_equal(errors, found.standard_errors, equal_nan=True):
         sections.append([ALLOWED])
-    sections.append(["Channels", *format_table(*tabulate_predicted(found))])
+    sections.append(["Channels", *format_table(*_tabulate_predicted(found))])
     if np.isfinite(found.chi_square):
         kind = "" if np.isinf(found.noise_freedom) else f", F with {found.freedom} and {found.noise_freedom:.4g}"
         chi_square = f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom"
@@ -49,13 +49,8 @@ def write_validation(found: Validation) -> str:
     return join_sections(*sections)
 
 
-def tabulate_predicted(found: Validation) -> Table:
-    """Return a row for each channel: how much of it is predicted, and the tests of its residuals.
-
-    Parameters
-    ----------
-    found : Validation
-    """
+def _tabulate_predicted(found: Validation) -> Table:
+    """Return a row for each channel: how much of it is predicted, and the tests of its residuals."""
     rows, titles = [], ["", "values", "fit (%)", "R²", "rms error", "lag 1", "P(white)"]
     tests = dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
     for label, _, comparison, k in list_channels(found.comparisons, found.run_names):

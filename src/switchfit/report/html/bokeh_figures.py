@@ -63,7 +63,7 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
         Of the same run, by the names of their sources.
     run : Timed
     """
-    sources = {name: make_source(name, own) for name, own in columns.items()}
+    sources = {name: _make_source(name, own) for name, own in columns.items()}
     times = models.Range1d(name="times")
     blocks: list[Any] = []
     for c, own in enumerate(curves):
@@ -88,14 +88,8 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
     return column(*blocks, spacing=6, **WIDE)
 
 
-def make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
-    """Return a source with the columns, and those of the fit that the page's script keeps, but none of their numbers.
-
-    Parameters
-    ----------
-    name : str
-    columns : iterable of str
-    """
+def _make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
+    """Return a source with the columns, and those of the fit that the page's script keeps, but none of their numbers."""
     return models.ColumnDataSource({key: [] for own in columns for key in (own, f"fit_{own}")}, name=name)
 
 
@@ -223,7 +217,7 @@ def draw_slice() -> Plot:
     """Return an empty figure of the rise of J along one unknown; the page's script fills it."""
     plot = _make_figure(SLICE_HEIGHT, "", "rise of J")
     plot.xaxis.axis_label.name = "slice-label"
-    source, mark = make_source("slice", ("x", "exact", "quadratic")), make_source("mark", ("x", "y"))
+    source, mark = _make_source("slice", ("x", "exact", "quadratic")), _make_source("mark", ("x", "y"))
     plot.line("x", "exact", source=source, line_color=PAGE_FIT_COLOUR, line_width=2, legend_label="exact")
     plot.line("x", "quadratic", source=source, legend_label="quadratic", tags=["muted"], **DASHED_LOOK)
     plot.scatter("x", "y", source=mark, size=10, fill_color=PAGE_FIT_COLOUR, line_color=PAGE_DATA_COLOUR, tags=["edge"])
