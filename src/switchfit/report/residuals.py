@@ -106,7 +106,7 @@ def _draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> None:
 
 
 def _draw_quantiles(channel: ChannelResiduals, ax: Axes) -> None:
-    """Draw sorted standardised residuals against the quantiles of the normal distribution: a straight line if normal."""
+    """Draw sorted standardised residuals against quantiles of the normal distribution: a straight line if normal."""
     n = len(channel.values)
     expected = special.ndtri((np.arange(1, n + 1) - 0.5) / n)
     ax.plot(expected[[0, -1]], expected[[0, -1]], "-", color=FIT_COLOUR, linewidth=THIN)

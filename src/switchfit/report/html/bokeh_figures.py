@@ -89,7 +89,7 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
 
 
 def _make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
-    """Return a source with the columns, and those of the fit that the page's script keeps, but none of their numbers."""
+    """Return a source with the columns, and those of the fit that the script keeps, but none of their numbers."""
     return models.ColumnDataSource({key: [] for own in columns for key in (own, f"fit_{own}")}, name=name)
 
 
