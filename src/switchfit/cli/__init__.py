@@ -78,6 +78,7 @@ def main() -> None:
     gc.set_threshold(YOUNG_OBJECTS, 20, 100)
     # pydantic would look for plugins in the metadata of every installed package, which takes 10 to 20 ms.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    # The module of one command alone is imported if its name is the first argument.
     asked = [name for name in sys.argv[1:2] if name in COMMANDS]
     try:
         _build_app(asked or COMMANDS)(prog_name="switchfit")

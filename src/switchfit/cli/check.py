@@ -40,10 +40,12 @@ def check(
 
     terminal.print_text(f"{write_problem(loaded.problem, full=full)}\n")
     terminal.print_list("Logs", loaded.issues)
+    # Building the evaluator makes the mesh and compiles: from here on the model has run.
     evaluator = evaluator_of(loaded.problem)
     terminal.print_text(f"{write_steps(evaluator, full=full)}\n")
     if terminal.is_asked("verbose"):
         terminal.print_note(evaluator.engine)
+    # The paper's equations take seconds, the Taylor remainders of J a moment.
     derivatives = sf.check_derivatives(loaded.problem, paper=full)
     short = f"Derivatives of J along a random direction\n  {write_orders(derivatives)}"
     terminal.print_text(f"{derivatives if full else short}\n")

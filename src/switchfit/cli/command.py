@@ -30,6 +30,8 @@ def command(*options: str) -> Callable[[Callable[..., None]], Callable[..., None
     def decorate(run: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(run)
         def run_command(**given: object) -> None:
+            # A set that all of the command line reads: passing it through every function that prints would make each
+            # signature longer. It is cleared for tests, which run several commands in one process.
             asked_options.update(name for name in names if given.pop(name))
             try:
                 with report_errors():
@@ -39,6 +41,8 @@ def command(*options: str) -> Callable[[Callable[..., None]], Callable[..., None
 
         kind = inspect.Parameter.KEYWORD_ONLY
         added = [inspect.Parameter(name, kind, default=False, annotation=COMMON[name]) for name in names]
+        # Annotations are text (PEP 563) in the commands' modules, and typer would evaluate them in this one, where
+        # their names mean nothing.
         own = inspect.signature(run, eval_str=True)
         run_command.__signature__ = own.replace(parameters=[*own.parameters.values(), *added])  # type: ignore[attr-defined]
         return run_command

@@ -36,6 +36,7 @@ def compare(
     from switchfit.io.logs.files import name_files
 
     files.make_folder(out)
+    # Usually all are called estimate.json: then the folders tell them apart.
     names = name_files(saved)
     estimates, changes = [], []
     for name, path in zip(names, saved, strict=True):

@@ -44,12 +44,15 @@ def report_errors() -> Iterator[None]:
     try:
         with _log_if_verbose(), handle_interrupt(interrupt):
             yield
+    # All of it: a model file may call sys.exit, or raise KeyboardInterrupt, and that must not look like an exit code or
+    # a Ctrl-C of ours. Whether it comes from a user's file is asked first.
     except BaseException as error:
         users = find_user_place(error) is not None
         if isinstance(error, typer.Exit) and not users:
             raise
         if is_asked("debug"):
             traceback.print_exc()
+        # A result so far is handled inside, by `stop_on_interrupt`; what arrives here came before there was any.
         if isinstance(error, CtrlC) or (isinstance(error, KeyboardInterrupt) and not users):
             fail("interrupted before there was anything to write.", EXIT_INTERRUPTED)
         if not (users or isinstance(error, Exception)):
@@ -61,12 +64,14 @@ def _explain(error: BaseException, *, users: bool) -> NoReturn:
     """Print the error and exit; `users` is whether it was raised in a file of the user."""
     if users and not isinstance(error, InputError):
         fail(f"{describe_error(error)}. (--debug shows the full traceback.)")
+    # Its own text begins with the number of the error.
     if isinstance(error, OSError) and error.filename is not None:
         fail(f"{error.filename} cannot be read or written: {error.strerror}.")
     if isinstance(error, (ValueError, OSError)):
         fail(str(error))
     if isinstance(error, MemoryError):
         fail(f"not enough memory: {str(error) or 'the problem is too large'}.")
+    # The traceback was printed above, if --debug asked for it.
     if not is_asked("debug"):
         traceback.print_exception(error)
     fail("this is an error in switchfit itself; please report it with the lines above.", EXIT_INTERNAL_ERROR)

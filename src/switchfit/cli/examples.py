@@ -24,6 +24,7 @@ def _complete_examples(incomplete: str) -> list[str]:
 
 def _list_examples() -> dict[str, Path]:
     """Return the examples by name: folders and single files."""
+    # Names with an underscore are parts of others, such as the first problem of `switchfit init`.
     found = sorted(find_examples().glob("[!_.]*"))
     return {path.stem: path for path in found if path.is_dir() or path.suffix == ".py"}
 
@@ -63,6 +64,7 @@ def examples(name: ExampleName = None, folder: ExampleFolder = None) -> None:
 def _choose_command(path: Path) -> str:
     """Return the command for a problem file: a search where the mode sequence is what is looked for."""
     contents = tomllib.loads(path.read_text(encoding="utf-8"))
+    # A library beside given sequences is only for `switchfit online`.
     is_search = "library" in contents and not any("mode_sequence" in run for run in contents.get("experiments", []))
     return "modes" if is_search else "fit"
 

@@ -44,6 +44,7 @@ def design(
     loaded = files.load(problem, out)
     from switchfit.cli.summaries import summarize_design
 
+    # A log of zeros is constant on purpose: only its times are used.
     terminal.print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
     table = loaded.contents.design
     settings = {} if table is None else table.model_dump(exclude_none=True)
@@ -53,6 +54,7 @@ def design(
     if out is not None:
         _write_plan(plan, out)
     errors.fail_for_refused(loaded.issues)
+    # Unknowns that do not count, for which names leaves them out, may stay undetermined.
     if lost := [name for name in plan.names if name in plan.undetermined]:
         errors.end_unreliable(f"{', '.join(lost)} cannot be estimated from such an experiment.")
 

@@ -70,6 +70,7 @@ def show(
 
 def write_figure(result: Result, path: Path) -> None:
     """Write the figure of a result; the ending of the name is its format."""
+    # A machine without a display; figures are drawn without pyplot, but a user's model file may import it.
     os.environ.setdefault("MPLBACKEND", "Agg")
     content = io.BytesIO()
     result.plot().savefig(content, format=path.suffix[1:], dpi=FIGURE_DPI)

@@ -56,6 +56,7 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     else:
         read = read_log(log)
         channels, others = choose_channels(read)
+        # A folder of a ROS bag, and a large log, are referred to where they are.
         copied = [log] if log.is_file() and log.stat().st_size <= LARGEST_COPY else []
         named = log.name if copied else Path(os.path.relpath(log, folder)).as_posix()
         texts["problem.toml"] = write_problem(read, channels, others, named)
@@ -89,7 +90,9 @@ def choose_channels(log: Log) -> tuple[list[str], list[str]]:
     varying = [name for name, values in log.values.items() if _is_varying(values)]
     is_track = log.has_positions and {"east", "north"} <= set(varying)
     if is_track:
+        # A stable sort: all other channels keep the order of the file.
         varying.sort(key=lambda name: name not in ("east", "north"))
+    # They belong to other channels, and are no states.
     usable = [name for name in varying if not name.startswith("sigma")]
     if not usable:
         raise InputError(
@@ -103,6 +106,8 @@ def choose_channels(log: Log) -> tuple[list[str], list[str]]:
 def _is_varying(values: FloatArray) -> bool:
     """Return whether a channel has enough samples, is not constant, and does not just count the rows."""
     known = values[np.isfinite(values)]
+    # Of the differences, so that a counter, which rises by the same each time, is no channel. Relative to the range:
+    # rounding of a straight line is no variation.
     return len(known) >= FEWEST_SAMPLES and bool(np.ptp(np.diff(known)) > 1e-9 * np.ptp(known))
 
 
@@ -118,14 +123,19 @@ def _guess_levels(values: FloatArray) -> tuple[int, FloatArray, FloatArray, Floa
     A step from one mean to another at that row explains most of the values, scaled alike. The second level is that of
     the second half of the rows after it.
     """
+    # With z the values less their mean, scaled, and S_k the sum of the first k of them: two means instead of one take
+    # S_k^2 (1/k + 1/(n - k)) off the sum of squares. The largest of these over k is the best step, all in one pass.
     sums, count = np.cumsum((values - values.mean(0)) / values.std(0), axis=0), len(values)
     rows = np.arange(1, count)
     explained = (sums[:-1] ** 2).sum(1) * (1 / rows + 1 / (count - rows))
+    # Not in the first or last twentieth, where a single outlier makes the best step.
     inside = slice(max(count // 20, 1), -max(count // 20, 1))
     k = int(rows[inside][explained[inside].argmax()])
+    # The state approaches its new level exponentially: the mean of the second half is nearer to it.
     half = k + (count - k) // 2
     before, after = values[:k].mean(0), values[half:].mean(0)
     off = np.concatenate([values[:k] - before, values[half:] - after]).std(0)
+    # A log without noise, as a simulation writes it, still needs a positive sigma.
     return k, before, after, np.where(off > 0, off, np.abs(after - before) * 1e-3 + 1e-12)
 
 
@@ -140,8 +150,10 @@ def write_problem(log: Log, channels: list[str], others: list[str], file: str) -
     file : str
         The log, relative to the problem file.
     """
+    # Others would be unreadable in a report: a log in ms or ns is fitted in s.
     time_unit = log.time_unit if log.time_unit in ("s", "min", "h", "d") else "s"
     scale = SECONDS_OF_UNIT[log.time_unit] / SECONDS_OF_UNIT[time_unit] if log.time_unit else 1.0
+    # The file may need repair = ["sort"], which is written into it; the guesses are made of sorted rows.
     picked = np.argsort(log.times, kind="stable")
     times = log.times[picked] * scale
     values = np.stack([_fill_gaps(log.values[name][picked]) for name in channels], axis=1)

@@ -85,6 +85,7 @@ def fit(
     folder stands for the logs in it. A log that cannot be used is reported, and the next one is fitted; the exit code
     is that of the worst.
     """
+    # What is not given stays as the file has it.
     overrides = options_module.select_given(strategy=strategy, hessian=hessian, max_iterations=max_iterations)
     drawn = "" if out is None or no_figures else figures
     output = Output(out, figures=drawn, certificate=certificate, full=full)
@@ -98,6 +99,7 @@ def fit(
     from switchfit.cli.summaries import summarize_estimate
 
     terminal.print_json(summarize_estimate(estimate) | {"out": out})
+    # The order of the exit codes: wrong input first, then a fit that did not converge, then one that did but is bad.
     errors.fail_for_refused(loaded.issues)
     if not estimate.status.successful:
         errors.end_unreliable(f"not converged. {estimate.message}")
@@ -181,6 +183,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
         try:
             loaded = _override(files.load(model, log=path), overrides)
             estimate = estimate_problem(loaded, prepare_figures=bool(output.figures))
+        # Anything that a log or a model file does: the next log may be good.
         except Exception as raised:
             error = str(raised) if isinstance(raised, InputError) else describe_error(raised)
         rows.append(describe_fit(str(path), estimate, error))
@@ -194,6 +197,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
             write_atomically(write_logs(rows, table), table)
         if estimate is not None and estimate.status.name == "INTERRUPTED":
             break
+    # A row with a message is refused, or was fitted and is not converged or bad.
     refused = sum(row["verdict"] == "refused" for row in rows)
     failed, left = sum(bool(row["message"]) for row in rows) - refused, len(logs) - len(rows)
     counts = f"{len(rows) - refused - failed} fitted, {failed} not, {refused} refused"
@@ -217,6 +221,7 @@ def _save(estimate: Estimate, path: Path, provenance: Provenance | None, *, comp
     from switchfit.io.saved_fits import save_fit
     from switchfit.uncertainty.certificate import certify
 
+    # Without an evaluator, `certify` checks all but the paper's equations.
     certificate = estimate.certificate if complete else certify(estimate, None)
     save_fit(estimate.complete(), certificate, path, provenance)
 

@@ -42,9 +42,11 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
         raise InputError(
             f"{loaded.path} names a problem that {contents.problem.name!r} builds in Python: write the sequence there."
         )
+    # What the user wrote, and nothing that is a default: the file stays as short as it was.
     tables = contents.model_dump(exclude_unset=True, exclude_none=True)
     for e, (table, run) in enumerate(zip(tables["experiments"], problem.experiments, strict=True)):
         table |= _describe_run(estimate, e, run)
+        # A state that the file says is known stays known; the others get their estimates as guesses.
         for entry, value in zip(table.get("initial_state", ()), estimate.initial_state[e], strict=False):
             if not entry.get("fixed"):
                 entry["value"] = _confine(value, entry.get("lower", -np.inf), entry.get("upper", np.inf))
@@ -54,13 +56,16 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
         table["value"] = _confine(estimate.parameters[name], parameter.lower, parameter.upper)
         if parameter.fixed:  # the search has held it
             table["fixed"] = True
+        # A bare number where nothing else is known, as it is written by hand.
         parameters[name] = table["value"] if set(table) == {"value"} else table
+    # The search may have used other durations than the file; those that it used make the same problem.
     options = {key: value for key, value in tables.get("options", {}).items() if key != "min_duration"}
     durations = problem.min_duration  # the library may have had a shorter one
     if isinstance(durations, Mapping):
         durations = {mode: seconds for mode, seconds in durations.items() if seconds}
     tables["options"] = options | ({"min_duration": durations} if durations else {})
     home = loaded.path.absolute().parent
+    # Paths are relative to the file that has them, which is another folder now.
     moved = replace_files(tables, lambda name: name if Path(name).is_absolute() else make_relative(home / name, folder))
     head = f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses."
     return "\n".join([head, *write_table(moved), ""])

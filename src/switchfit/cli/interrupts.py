@@ -29,6 +29,7 @@ def handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iter
     """Return a context in which Ctrl-C calls a handler; without effect if SIGINT is ignored, or outside the main
     thread, which alone has signal handlers.
     """
+    # SIGINT that is ignored, as under nohup or in a background job of a shell, stays ignored.
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
         yield
@@ -55,6 +56,8 @@ def stop_on_interrupt(
     requested = threading.Event()
 
     def request(number: int, frame: FrameType | None) -> None:
+        # A search with strategies cannot be asked to stop by the callback of one of its fits, which others follow. It
+        # catches the exception, and keeps its best fit.
         if requested.is_set() or is_searching():
             requested.set()
             raise CtrlC

@@ -75,11 +75,14 @@ class LivePage:
     def show(self, line: str) -> None:
         """Add what the estimator has said, a line of JSON."""
         count, lines = self._state
+        # One assignment of a tuple, which is atomic: a thread that answers sees the state before or after it, and needs
+        # no lock. The count goes on while old lines are dropped, so that a page knows what it has missed.
         self._state = (count + 1, (*lines[1 - MOST_KEPT_LINES :], line))
 
     def list_lines(self, after: int) -> str:
         """Return the lines after so many, with how many there are, as JSON."""
         count, lines = self._state
+        # A page that knows more lines than there were is from an earlier run: it gets all of them.
         new = lines[max(len(lines) - (count - after), 0) :] if after <= count else lines
         return f'{{"head": {json.dumps(self.head)}, "count": {count}, "lines": [{",".join(new)}]}}'
 
@@ -94,11 +97,14 @@ def _make_handler(live: LivePage) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             asked = urlsplit(self.path)
+            # A name of another site that is resolved to 127.0.0.1 (DNS rebinding) would otherwise let its scripts read
+            # this.
             if self.headers.get("Host", "").partition(":")[0] not in LOCAL_HOSTS:
                 self.send_error(403)
             elif asked.path == "/":
                 self.answer("text/html", live.page)
             elif asked.path == "/now.json":
+                # Twelve digits at most: int() of a million digits takes seconds.
                 after = parse_qs(asked.query).get("after", ["0"])[0][:12]
                 self.answer("application/json", live.list_lines(int(after) if after.isdecimal() else 0))
             else:

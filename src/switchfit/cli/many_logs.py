@@ -32,6 +32,7 @@ def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:
     InputError
         If a pattern matches nothing.
     """
+    # A log that two patterns match is fitted once.
     named = [log for path in paths for log in find_logs(Path(), str(path)) or [str(path)]]
     found = list(dict.fromkeys(named))
     return list(zip(name_files(found), map(Path, found), strict=True))
@@ -103,6 +104,7 @@ def describe_row(row: Mapping[str, Any]) -> str:
     row : mapping
     """
     numbers = []
+    # An unknown is a column that has one for its standard error beside it.
     for name in (name for name in row if ERROR.format(name) in row):
         value, error, _ = numbers_module.format_rounded(row[name], row[ERROR.format(name)])
         numbers.append(f"{name} = {value} {error}".rstrip())

@@ -59,10 +59,12 @@ def modes(
 
     terminal.print_list("Logs", loaded.issues)
     search = _search(loaded, loaded.library | settings)
+    # Before the text is printed, which names the file.
     best = None if out is None else _write_best(search, loaded, out)
     summary, drawn = summarize_modes(search) | {"problem_file": best}, figures if search.chosen else ""
     files.show(search, summary, out, "modes", drawn, saved=True)
     errors.fail_for_refused(loaded.issues)
+    # The library admits no sequence: a mistake in the input, not a result.
     if search.status.name == "NO_SUCCESSION":
         errors.fail(search.message)
     if search.status.name not in USABLE:

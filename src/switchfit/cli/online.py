@@ -98,15 +98,18 @@ def online(
     from switchfit.online.log import build_log
     from switchfit.strategy.library import build_library
 
+    # Before the first sample: a folder that cannot be made must not lose what was estimated.
     for file in filter(None, (state, journal)):
         file.parent.mkdir(parents=True, exist_ok=True)
     sensors = loaded.problem.experiments[0].measurements
+    # Nodes as well as samples need room, and between samples there may be nodes of the mesh.
     room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
     settings = loaded.contents.online.model_dump(exclude_none=True) | options.select_given(window=window)
     settings |= {"max_switches": max_switches, "budget": budget, "capacity": room}
     library = build_library(loaded.problem, **loaded.library)  # modes that it leaves out never follow
     settings |= {"successions": library.successions, "min_duration": library.durations}
     estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
+    # The page outlives the samples, until Ctrl-C, and is closed on every way out.
     with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
         recorded, refused, interrupted = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
         if estimator.now is None:
@@ -138,6 +141,7 @@ def _start(
         estimator.keep_journal(journal)
     if estimator.now is not None:
         terminal.print_note(f"going on from t = {estimator.now.time:.6g}, with the threshold {estimator.threshold:.4g}")
+    # A threshold that was found by simulation is worth knowing: with --threshold it need not be found again.
     elif alarms["false_alarms"] is not None:
         terminal.print_note(f"threshold {estimator.threshold:.4g}")
     return estimator
@@ -157,13 +161,17 @@ def _run(
     (run,) = loaded.problem.experiments
     last = -math.inf if estimator.now is None else estimator.now.time
     with interrupts.stop_on_interrupt(repr, "sample") as report:
+        # The callback of `stop_on_interrupt` as a question: has Ctrl-C been pressed?
         stopped = partial(report, None)
+        # A log that is replayed from a saved state goes on behind the last sample that the state has seen.
         logged = list_updates([(item.times, item.values) for item in run.data])
         samples: Iterable[Any] = _read_lines(stopped) if stdin else ((t, y, None) for t, y in logged if t > last)
         for number, sample in enumerate(samples, start=1):
             if stdin and not sample.strip():
                 continue
             try:
+                # One bad line of a stream must not end an estimate of hours; one of a log is a mistake in a file, and
+                # an error.
                 t, y, u = read_sample(sample, run) if stdin else sample
                 now = estimator.update(t, y, u=u)
             except REFUSED as error:
@@ -188,6 +196,8 @@ def _read_lines(stopped: Callable[[], bool]) -> Iterator[bytes]:
     stream = typer.get_binary_stream("stdin")
     while True:
         try:
+            # While it waits in readline no callback runs: here Ctrl-C raises, and is passed on as the signal to the
+            # handler that counts it.
             with interrupts.handle_interrupt(interrupts.interrupt):
                 line = b"" if stopped() else stream.readline()
         except interrupts.CtrlC:

@@ -39,6 +39,7 @@ def read_sample(line: bytes, run: Experiment) -> tuple[Any, Any, Any]:
         got = shorten(line.decode(errors="replace").strip())
         raise ValueError(f"a sample is one line of JSON with the keys t, y and u, such as {EXAMPLE}; got {got}.")
     t, y, u = (given.get(key) for key in "tyu")
+    # Without an origin a text as t is left to the estimator, whose message says what it must be.
     if isinstance(t, str) and run.origin is not None:
         t = float(run.origin.to_numbers(as_date(t, "t"), run.time_unit, "t"))
     return t, _fill(y), u

@@ -48,10 +48,13 @@ def _rebuild_problem(
             "switchfit fit PROBLEM.toml --out DIR saves what is needed."
         )
     where = Path(given.folder) if folder is None else folder
+    # A log that was given by hand (--problem) is remembered beside the text of the file.
     own = where / given.log if given.log else None
     try:
         return load_problem(where / given.problem_file, own if log is None else log, text=given.text)
     except InputError as error:
+        # With another log, only the model must be as it was. If nothing has changed, the error itself says what is
+        # wrong.
         needed = [digest for digest in given.files if log is None or digest.name.endswith(".py")]
         changed = [each.name for each in needed if digest_file(where, where / each.name).sha256 != each.sha256]
         if not changed:
@@ -99,6 +102,7 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
     given = Estimate.load(path).provenance
     loaded = _rebuild_problem(path, given, folder)
     estimate = Estimate.load(path, problem=loaded.problem)
+    # By values, not by hashes: a log that was rewritten with the same numbers is the same data.
     if not _has_data(estimate, loaded.problem):
         raise InputError(
             f"{path} was fitted to other values than the files in {loaded.path.parent} have now: fit them again."

@@ -104,6 +104,7 @@ def summarize_validation(found: Validation) -> dict[str, Any]:
     found : Validation
     """
     refit = () if found.refit is None else found.refit.theta_names
+    # From where a value comes: kept from the fit, estimated from this run, or a guess that nothing determines.
     sources = ["fit" if name in found.kept else "run" if name in refit else "guess" for name in found.theta_names]
     columns = {
         "name": found.theta_names,
@@ -143,6 +144,7 @@ def summarize_comparison(found: ModelComparison) -> dict[str, Any]:
         "weight": found.weights,
         **pick_attributes(found, "log_likelihood", "aicc", "delta_aicc", "bic", "delta_bic"),
     }
+    # The columns of a comparison are in the order in which the models were given.
     rows = sorted(zip_rows(columns), key=lambda row: float(row["bic"]))
     return {**pick_attributes(found, "best", "values"), "models": rows}
 

@@ -87,6 +87,7 @@ def write_rows(rows: Sequence[Mapping[str, Any]], columns: Iterable[str] = ()) -
         Left out, those of all rows as they come.
     """
     text = io.StringIO()
+    # CRLF, as RFC 4180 has it: spreadsheets on Windows need it, others take it.
     table = csv.DictWriter(text, list(columns) or list_columns(rows), restval="", lineterminator="\r\n")
     table.writeheader()
     for row in rows:

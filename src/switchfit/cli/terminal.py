@@ -37,6 +37,8 @@ def print_json(value: object) -> None:
 
 def format_json(value: object) -> str:
     """Return a value as one line of JSON; numbers that are not finite are null."""
+    # The json of Python writes NaN, which is no JSON. pydantic writes null, and is loaded already; arrays go through
+    # `fallback`.
     from pydantic_core import to_json
 
     return to_json(value, inf_nan_mode="null", fallback=lambda array: array.tolist()).decode()

@@ -27,6 +27,7 @@ def write_table(table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterato
     path : tuple of str, optional
         Keys of the tables that it is in, and its own.
     """
+    # TOML has no end of a table: keys that stand behind [inner] would belong to it, so that plain values come first.
     nested = {key: value for key, value in table.items() if _is_nested(key, value)}
     for key, value in table.items():
         if key not in nested:

@@ -33,6 +33,7 @@ def choose_times(given: str, experiment: Experiment) -> FloatArray | Literal["sa
     """
     if given in ("", "samples"):
         return "samples" if given else None
+    # tf may be estimated: then the grid ends at its guess.
     t0, tf = experiment.ends_of_modes(experiment.initial_times)[[0, -1]].tolist()
     step = np.nan
     with contextlib.suppress(ValueError):
@@ -43,6 +44,7 @@ def choose_times(given: str, experiment: Experiment) -> FloatArray | Literal["sa
             f"{MOST_SIMULATED_TIMES:,} times from "
             f"t0 = {t0:g} to tf = {tf:g}; got {given!r}."
         )
+    # A quotient such as 0.3 / 0.1 is 2.9999999999999996: the last time must not be lost, nor lie behind tf by rounding.
     count = int(np.floor((tf - t0) / step * (1 + 1e-12)))
     return np.minimum(t0 + step * np.arange(count + 1), tf)
 
@@ -69,6 +71,7 @@ def write_trajectories(names: Sequence[str], runs: Sequence[Trajectory]) -> str:
     (unit,) = units
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\r\n")
+    # A column that some rows leave empty, so that all runs are one table.
     dated = any(run.origin is not None for run in runs)
     columns = ["t" if unit == "s" else f"t ({unit})", *(["date"] if dated else [])]
     table.writerow(["experiment", *columns, "mode", *runs[0].state_names])

@@ -33,6 +33,7 @@ def validate(
     from switchfit.estimation.estimates import Estimate
 
     estimate = Estimate.load(saved)
+    # The saved estimate is data alone: its problem is built again only as far as the other run needs it.
     loaded = load_other_run(saved, estimate.provenance, other, folder)
     files.make_folder(out)
     changes = list_changed_models(estimate.provenance, loaded)

@@ -47,9 +47,12 @@ def load_object(reference: str, folder: Path, what: str) -> UserObject:
     InputError
         If the file or the object is missing, or running the file raises.
     """
+    # The absolute path is the key: two problem files name one model by different relative paths, and it runs once. What
+    # messages and tracebacks show is the path as it was last written.
     path, name = find_object(reference, folder, what)
     key = str(path.resolve())
     _files[key] = path
+    # The time of the last change is a part of the cache's key: in a notebook, a model that was edited runs again.
     module = _run(key, path.stat().st_mtime_ns)
     if not hasattr(module, name):
         public = [key for key in vars(module) if not key.startswith("_")]
@@ -101,6 +104,7 @@ def _replace_in(value: object, change: Callable[[str], str]) -> object:
         return replace_files(value, change)
     if isinstance(value, (list, tuple)):
         return [_replace_in(entry, change) for entry in value]
+    # Only text of the form of a reference is changed: units and names of channels look different.
     match = _REFERENCE.fullmatch(value) if isinstance(value, str) else None
     return value if match is None else f"{change(match[1])}:{match[2]}"
 
@@ -108,6 +112,7 @@ def _replace_in(value: object, change: Callable[[str], str]) -> object:
 def call(function: Callable[..., UserObject], what: str, **arguments: object) -> UserObject:
     """Call a user's factory; raise InputError if it does not take the arguments, or with the place if it fails."""
     try:
+        # Bound before the call, so that a TypeError that the function raises inside is not taken for wrong arguments.
         inspect.signature(function).bind(**arguments)
     except TypeError as error:
         takes = ", ".join(inspect.signature(function).parameters) or "no arguments"
@@ -148,9 +153,13 @@ def build_at(where: str, build: Callable[Given, Built], *arguments: Given.args, 
     """
     try:
         return build(*arguments, **named)
+    # An InputError has its place already; a second one would hide it behind that of the table around it.
     except (InputError, KeyboardInterrupt):
         raise
     except BaseException as error:
+        # A user's function may raise anything, at any depth below ours: what counts is whether the traceback passes a
+        # file that was loaded here. ValueError and TypeError without such a place are our own checks of what the file
+        # says.
         if find_user_place(error) is not None:
             raise InputError(f"{where}: {describe_error(error)}.") from error
         if isinstance(error, (ValueError, TypeError)):
@@ -160,6 +169,8 @@ def build_at(where: str, build: Callable[Given, Built], *arguments: Given.args, 
 
 def describe_error(error: BaseException) -> str:
     """Return an exception as text, with its place in a user's file if it has one."""
+    # An error of ours that was raised from another one explains it in several lines; of a foreign one the first line is
+    # enough.
     explained = error.__cause__ is not None and isinstance(error, ValueError)
     place, what = find_user_place(error), (str(error) if explained else get_first_line(error)).rstrip(".")
     return f"{place}: {what}" if place else what
@@ -175,8 +186,11 @@ def find_user_place(error: BaseException | None) -> str | None:
     cause = find_user_place(error.__cause__)
     if cause is not None:
         return cause
+    # A file with a syntax error has no frame of its own: it never ran.
     if isinstance(error, SyntaxError) and error.filename in _files:
         return f"{_files[error.filename]}, line {error.lineno}"
+    # Frames by file name: JAX puts its own between those of the user, and the innermost of the user is where the
+    # mistake is.
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename in _files]
     if not frames:
         return None
@@ -193,6 +207,8 @@ def _run(key: str, changed: int) -> ModuleType:
     if specification is None or specification.loader is None:
         raise InputError(f"{path} cannot be loaded as a Python file.")
     module = importlib.util.module_from_spec(specification)
+    # Registered before it runs: dataclasses and pickle look their module up there. Its own folder is searched only
+    # while it runs, as Python does for a script, so that names in it hide nothing from other files.
     sys.modules[module.__name__] = module
     sys.path.insert(0, str(path.parent))
     try:

@@ -31,6 +31,8 @@ def fit_kinds(problem: Problem, kinds: Sequence[HessianKind], say: Say) -> dict[
     found: dict[str, Found] = {}
     for kind in kinds:
         say(kind)
+        # One fit, and no strategy: what is compared is the algorithm. Steepest descent needs a thousand iterations and
+        # more.
         fit = fit_locally(problem, hessian=kind, max_iterations=20000)
         norms = [record.optimality for record in fit.history]
         found[kind] = {**fit_summary.summary(fit), "history": [list(range(len(norms))), norms]}

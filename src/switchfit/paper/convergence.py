@@ -38,6 +38,7 @@ def compute_convergence(quick: bool, say: Say) -> Found:
         "fits": fit_kinds(problem, ALGORITHMS, say),
     }
     first = fit_locally(problem, hessian="descent-first")
+    # Section II-A: descent until D2J is positive definite. The history says at which theta each iteration began.
     positive = [np.linalg.eigvalsh(evaluate(problem, record.theta).hessian)[0] > 0 for record in first.history]
     found["descents"] = positive.index(True)
     return found
@@ -50,6 +51,7 @@ def draw_convergence(found: Found) -> dict[str, Figure]:
 
 def measure_order(history: list[list[float]]) -> float:
     """Return the observed order of the last steps above rounding: log(e_{k+1}/e_k) / log(e_k/e_{k-1})."""
+    # With e_{k+1} = C e_k^q, the ratio of successive slopes of log e is q. Below 1e-10 the norm is rounding.
     norms = np.array([n for n in history[1] if n > 1e-10])
     slopes = np.diff(np.log(norms))
     return float(slopes[-1] / slopes[-2])
@@ -57,6 +59,7 @@ def measure_order(history: list[list[float]]) -> float:
 
 def measure_factor(history: list[list[float]]) -> float:
     """Return the factor by which the norm of the gradient falls in one iteration, over the last half of them."""
+    # The last half: the first iterations are far from the linear rate.
     iterations, norms = np.array(history)
     middle = int(np.searchsorted(iterations, iterations[-1] / 2))
     return float((norms[-1] / norms[middle]) ** (1 / (iterations[-1] - iterations[middle])))

@@ -56,6 +56,7 @@ def fit_log(
 
 def summary(fit: Fit) -> dict[str, Any]:
     """Return the result of a fit, with the second-order sufficient conditions, as plain numbers."""
+    # Sufficient for a strict minimum: DJ = 0 and D2J positive definite on the free directions.
     smallest = certify(complete(fit), None).smallest_eigenvalue
     return {
         "theta": dict(zip(fit.theta_names, fit.theta.tolist(), strict=True)),

@@ -32,10 +32,12 @@ def compare_sample_sets() -> list[Found]:
     sets.append((f"0 to {HORIZON:g} s without those in slip", HORIZON, outside))
     found: list[Found] = []
     for label, tf, times in sets:
+        # A horizon that ends in slip has one transition, and tau_2 is no unknown of it.
         theta = TRUTH if tf > end else (TRUTH[0], TRUTH[2])
         data = Measurements(times, vehicle.positions_at(path, times), vehicle.position, sigma=POSITION_SIGMA)
         hessian = evaluate(vehicle.stick_slip(data, theta, tf=tf)).hessian
         inside = int(np.sum((times > begin) & (times <= end)))
+        # At the truth without noise: the residuals are 0, so that D2J is the Fisher information, and needs no fit.
         errors = np.sqrt(np.diag(np.linalg.inv(hessian)))
         found.append({"label": label, "samples": len(times), "in_slip": inside, "mu": float(errors[-1])})
     return found

@@ -93,6 +93,8 @@ def _coefficients(speeds: Input, say: Say) -> Found:
     parameters = {name: Parameter(value) for name, value in MAGIC_FORMULA.items()}
     problem = tyre_logs.on_tyres(Measurements(times, exact, vehicle.position), speeds, parameters)
     hessian = evaluate(problem).hessian
+    # H_ij p_i p_j is the Hessian in p / p_true: what a change of each by the same part does. Coefficients that are 0
+    # stay as they are.
     size = np.array([abs(value) or 1.0 for value in MAGIC_FORMULA.values()])
     analysis = identifiability(problem)
     return {
@@ -121,6 +123,7 @@ def draw_magic(found: Found) -> dict[str, Figure]:
     yaw.set_ylim(-0.02, 0.55)
     yaw.legend(frameon=False, fontsize=6.5, loc="upper left")
     tidy(yaw, "time (s)", "yaw rate (rad/s)", letter="(b)")
+    # Eigenvalues ascend, and those that are rounding may be negative.
     values = np.abs(np.array(found["eigenvalues"]))[::-1]
     determined = int(np.count_nonzero(values > EIGENVALUE_ROUNDING * values[0]))
     rank = np.arange(1, len(values) + 1)

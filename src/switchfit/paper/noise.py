@@ -39,6 +39,7 @@ def compute_noise(quick: bool, say: Say) -> Found:
     rows: list[Found] = []
     for level, sigma in enumerate(levels):
         say(f"sigma {sigma:g} m")
+        # A generator for each level: fewer runs (--quick) draw the first of the same noise.
         rng, theta = np.random.default_rng(level), []
         for _ in range(runs if sigma else 1):
             noisy = exact + sigma * rng.standard_normal(exact.shape)
@@ -47,12 +48,14 @@ def compute_noise(quick: bool, say: Say) -> Found:
             )
             if fit.status.successful:
                 theta.append(fit.theta)
+        # The estimate without noise, of the first level, has a bias of its own: errors are given from both.
         rows.append(_level(np.array(theta), np.array(rows[0]["median"] if rows else TRUTH)))
     return {"sigma": list(levels), "runs": runs, "levels": rows, "samples": compare_sample_sets()}
 
 
 def _level(theta: FloatArray, noise_free: FloatArray) -> Found:
     """Return percentiles of the errors of estimates (R, 3) at one level of noise."""
+    # Mean and rms of the relative errors, as the paper has them, and the spread about the noise-free estimate.
     normalised = theta / TRUTH - 1
     return {
         "converged": len(theta),

@@ -68,6 +68,8 @@ def _reference() -> ReferenceSignal:
         step = np.linspace(0.0, end - begin, 501)
         with use_float64():
             A = _matrix(k, damping)
+            # Exact samples: each state is exp(A h) times that at the begin of the segment, and not a step from the last
+            # one.
             path = np.asarray(jax.vmap(lambda h, A=A: expm(A * h))(jnp.asarray(step))) @ at
         times.append(begin + step)
         states.append(path)
@@ -81,6 +83,7 @@ def _matrix(k: Traced, c: Traced) -> jax.Array:
 
 def evaluate_exactly(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """Return J, its gradient and its Hessian from matrix exponentials, for tau not after that of the truth."""
+    # Forward over forward: there are three unknowns.
     first = jax.jacfwd(_cost)
     with use_float64():
         given = jax.jit(lambda theta: (_cost(theta), first(theta), jax.jacfwd(first)(theta)))(jnp.asarray(theta))
@@ -91,14 +94,18 @@ def evaluate_exactly(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
 def _cost(theta: jax.Array) -> Traced:
     tau, k, c = theta
     true_tau, true_k, true_c = LTI_TRUTH
+    # z'Qz = |x - x_m|^2 with z = (x, x_m).
     Q = jnp.kron(jnp.array([[1.0, -1.0], [-1.0, 1.0]]), jnp.eye(2))
     z, J = jnp.tile(jnp.array(LTI_INITIAL), 2), 0.0
+    # Three segments: both free, the model braked and the truth not yet, both braked.
     for length, damping, true_damping in (
         (tau, 0.0, 0.0),
         (true_tau - tau, c, 0.0),
         (LTI_HORIZON - true_tau, c, true_c),
     ):
         G = jax.scipy.linalg.block_diag(_matrix(k, damping), _matrix(true_k, true_damping))
+        # Van Loan: exp([[-G', Q], [0, G]] h) = [[., F], [0, E]] with E = exp(G h), and E'F is the integral of exp(G't)
+        # Q exp(G t) over the segment.
         blocks = expm(jnp.block([[-G.T, Q], [jnp.zeros((4, 4)), G]]) * length)
         forward = blocks[4:, 4:]
         J = J + 0.5 * z @ forward.T @ blocks[:4, 4:] @ z

@@ -52,6 +52,8 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say = l
         raise ValueError(f"there is no part {only!r}; the parts are {', '.join(PARTS)}.")
     names = list(PARTS) if only is None else [only]
     out.mkdir(parents=True, exist_ok=True)
+    # Results on disk are the state: a run that was interrupted goes on behind its last part. When all parts are there,
+    # and none is asked for by name, a new run begins.
     before: dict[str, Any] = json.loads((out / RESULTS_FILE).read_bytes()) if (out / RESULTS_FILE).exists() else {}
     results = before if only is not None or len(before) < len(PARTS) else {}
     if only is None:
@@ -59,6 +61,7 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say = l
     for number, name in enumerate(names, start=1):
         part, began = PARTS[name], time.perf_counter()
 
+        # Its place is bound by a default, since the loop goes on to the next one.
         def report(text: str, place: str = f"[{number}/{len(names)}] {part.title}") -> None:
             say(f"{place}: {text}")
 
@@ -69,6 +72,7 @@ def run(out: Path, *, quick: bool = False, only: str | None = None, say: Say = l
                 content = BytesIO()
                 figure.savefig(content, dpi=200, format=kind)
                 write_atomically(content.getvalue(), out / f"{title}.{kind}")
+        # In the order of the paper, whichever part was run last.
         results = {name: results[name] for name in PARTS if name in results}
         lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in results.items())  # one a part
         write_atomically(f"{{\n{lines}\n}}\n", out / RESULTS_FILE)

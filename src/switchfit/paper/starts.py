@@ -44,9 +44,11 @@ def compute_starts(quick: bool, say: Say) -> Found:
             theta, cost = None, None
             with suppress(NotIntegrableError):
                 fit = estimate(problem, start=start, **settings)
+                # Ctrl-C ends the study, not one of a thousand fits.
                 if was_interrupted(fit):
                     raise KeyboardInterrupt
                 theta, cost = (fit.theta.tolist(), fit.cost) if fit.status.successful else (None, None)
+            # Ends are grouped as they come: the first fit that ended somewhere stands for the group.
             same = (end for end in ends if _agree(end["theta"], theta))
             if (end := next(same, None)) is None:
                 ends.append(end := {"theta": theta, "cost": cost, "count": 0})

@@ -48,6 +48,7 @@ def compute_trials(quick: bool, say: Say) -> Found:
     for number, (force, differential) in enumerate(TRIALS, start=1):
         say(f"trial {number}")
         clean, _ = tyre_logs.log_on_tyres(SAMPLE_TIMES, tyre_logs.wheel_speeds(differential, force))
+        # The number of the trial is the seed: each has noise of its own, and the same one in every run.
         samples = clean + GPS_SIGMA * np.random.default_rng(number).standard_normal(clean.shape)
         reference = vehicle.gps_reference(SAMPLE_TIMES, samples)
         trial: Found = {

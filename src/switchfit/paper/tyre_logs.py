@@ -44,10 +44,12 @@ def wheel_speeds(
     (with reset at re-stick, so that it drives straight on). From 5 to 10 s, wheels 1 and 4 are faster by `differential`
     and 2 and 3 slower; the difference rises within `rise` and falls within `fall` (s).
     """
+    # The speed of (18), which has no tyres, is what the wheels are told to drive at on average.
     path = simulate_drive((*COMMANDED, TRUTH[2]), stick_force=stick_force, restick="reset")
     theta = path.states[:, 4]
     forward = np.cos(theta) * path.states[:, 1] + np.sin(theta) * path.states[:, 3]
     knots = [0.0, COMMANDED[0], COMMANDED[0] + rise, COMMANDED[1], COMMANDED[1] + fall, HORIZON]
+    # Knots of the ramps are nodes: an input that is linear between them has no other kinks.
     times = np.unique(np.concatenate([np.arange(0.0, HORIZON + 0.05, 0.1).round(1), knots]))
     mean = np.interp(times, path.times, forward)
     extra = np.interp(times, knots, [0.0, 0.0, differential, differential, 0.0, 0.0])

@@ -48,6 +48,7 @@ def stick_slip(
 ) -> Problem:
     """Return the estimation problem of equation (18): transition times and mu from `data`; `start` has this order."""
     system = skid_steer(stick_forces=(stick_force,) * 4, restick=restick)
+    # One mode more than transition times: of three numbers, two are times, and the modes are three.
     run = Experiment(data, VEHICLE_SEQUENCE[: len(start)], start[:-1], 0.0, tf)
     return Problem(system, run, {"mu": Parameter(start[-1], lower=0.05, upper=2.0, unit="1")})
 
@@ -62,6 +63,7 @@ def simulate_drive(
 ) -> Trajectory:
     """Simulate equation (18) at given transition times and mu, with a node every `step` seconds."""
     times = step * np.arange(round(tf / step) + 1)
+    # Data of zeros: simulation needs their times alone, as nodes.
     nothing = Measurements(times, np.zeros((len(times), 6)))
     return simulate(stick_slip(nothing, theta, tf=tf, stick_force=stick_force, restick=restick))
 
@@ -74,6 +76,7 @@ def build_simulated_problem() -> Problem:
 
 def positions_at(path: Trajectory, times: FloatArray) -> FloatArray:
     """Return positions (K, 2) at times that are nodes of the trajectory."""
+    # A little before the time: a transition stands twice, and k * step is not exactly a node by rounding.
     nodes = np.searchsorted(path.times, np.asarray(times) - 1e-9)
     return path.states[nodes][:, [0, 2]]
 

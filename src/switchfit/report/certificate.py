@@ -30,6 +30,7 @@ def tabulate_certificate(certificate: Certificate) -> Table:
     ----------
     certificate : Certificate
     """
+    # Constraints and kinks alike take a direction out of those in which the Hessian has to be positive.
     held = "; ".join(map(str, [*certificate.active, *certificate.kinks]))
     failures = "; ".join(map(str, certificate.failures))
     error = f"{certificate.integration_error:.1e} ({certificate.integration_error_of})"
@@ -70,6 +71,7 @@ def write_derivative_check(check: DerivativeCheck) -> str:
     """
     rows, titles = [], ["h", "J", "order", "+ gradient", "order", "+ Hessian", "order"]
     for k, (h, remainders) in enumerate(zip(check.steps, check.remainders, strict=True)):
+        # An order is the slope between two steps: the first one has none. NaN where both remainders are rounding.
         orders = [""] * 3 if k == 0 else ["-" if np.isnan(order) else f"{order:.2f}" for order in check.orders[k - 1]]
         cells = [text for r, order in zip(remainders, orders, strict=True) for text in (f"{r:.2e}", order)]
         rows.append([f"{h:.1e}", *cells])

@@ -21,6 +21,7 @@ def plot_convergence(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
     """
     drawn, ax = style.open_axes(ax, (6.4, 3.4))
     optimality = np.array([record.optimality for record in estimate.history], dtype=np.float64)
+    # A logarithmic axis has no 0, which an exactly solved problem has.
     shown = np.where(optimality > 0, optimality, np.nan)
     ax.set_yscale("log")
     ax.plot(

@@ -47,6 +47,7 @@ class DateLocator(Locator):
         self.zone: datetime.tzinfo = origin.zone or datetime.UTC
         self.start = float(date2num(origin.instant))
         self.length = SECONDS_OF_UNIT[normalize_time_unit(time_unit)] / SECONDS_OF_UNIT["d"]
+        # matplotlib finds round dates; what is drawn stays in numbers of the experiment, in which users read and zoom.
         self.dates = AutoDateLocator(tz=self.zone, minticks=2, maxticks=MOST_TICKS)
 
     def to_days(self, times: Sequence[float]) -> FloatArray:
@@ -59,9 +60,12 @@ class DateLocator(Locator):
 
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         """Return the ticks between two times."""
+        # Years outside of 1 to 9999 have no date in Python; an empty axis or a drag with the mouse gets there.
         days = np.clip(self.to_days([vmin, vmax]), -FARTHEST_DATE_IN_DAYS, FARTHEST_DATE_IN_DAYS)
         zone = self.zone
         if np.ptp(days) < SHORT_AXIS_IN_DAYS:
+            # The offset at the left end for the whole axis: clocks that change within it would leave out or repeat a
+            # tick.
             zone = datetime.timezone(num2date(days[0], tz=zone).utcoffset() or datetime.timedelta())
         ticks = self.dates.tick_values(*num2date(np.sort(days), tz=zone))
         return ((np.asarray(ticks) - self.start) / self.length).tolist()

@@ -39,6 +39,7 @@ def write_identifiability(found: Identifiability) -> str:
     every = f"the data determine all {count} unknowns; condition number of the scaled Hessian"
     not_all = f"the data do not determine {format_count(many, 'combination')} of the {count} unknowns."
     collapsed = f"{', '.join(found.idle)}, because a mode has collapsed: leave it out of mode_sequence."
+    # Sentences with whether they apply, in the order in which they are read; a name may appear in one of them only.
     cases = {
         f"{where} the cost does not depend on {others}, to second order.": others,
         f"{capitalise(describe_unread(found.unread, found.absent))}.": found.unread or found.absent,
@@ -64,6 +65,7 @@ def write_direction(found: Identifiability, direction: Direction) -> str:
     """
     # If only the opposite change was possible, describe that one.
     side = -1.0 if np.isnan(direction.rises[0]) and np.isfinite(direction.rises[1]) else 1.0
+    # Only the unknowns that matter for the direction, which its names are; its vector has all of them.
     places = [found.theta_names.index(name) for name in direction.names]
     moves = join_words([_format_move(found, i, side * float(direction.change[i])) for i in places])
     rise = _RISES[found.meaning].format(f"{found.rise:.2g}") if found.rise > 0 else ""
@@ -84,6 +86,7 @@ def _format_rises(direction: Direction, rise: str, cost: float) -> str:
     finite = [r for r in direction.rises if np.isfinite(r)]
     if not finite:
         return ": J could not be evaluated there."
+    # The larger of both: neither side raises J by more.
     worst = 0.0 if abs(max(finite)) <= RISE_ROUNDING * abs(cost) else max(finite)
     related = np.isfinite(cost) and abs(worst) < 10 * abs(cost)  # a ratio to a J near 0 means nothing
     relative = f" ({100 * worst / abs(cost):.2g} %)" if related else ""

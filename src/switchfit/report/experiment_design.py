@@ -40,6 +40,7 @@ def write_design(design: Design) -> str:
     design : Design
     """
     path, units = design.trajectory, design.problem.unknowns.units
+    # All unknowns, also those that do not count: their errors are what the design costs.
     columns = (design.theta_names, units, design.theta, design.standard_errors_before, design.standard_errors)
     rows, titles = [], ["unknown", "value", "standard error as given", "as designed", ""]
     for name, unit, value, *errors in zip(*columns, strict=True):
@@ -72,11 +73,13 @@ def plot_design(design: Design) -> Figure:
     design : Design
     """
     path, units = design.trajectory, dict.fromkeys(design.trajectory.state_units)
+    # A panel for the inputs, one for the states of each unit, and one for the shares of the samples.
     count = bool(design.inputs) + len(units) + 1
     figure = style.make_figure(8.0, 0.8 + 1.7 * count)
     axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0].tolist()
     if design.inputs:
         _draw_inputs(design, axes[0])
+    # Those behind the inputs, if there are any, up to the last but one.
     for ax, unit in zip(axes[-len(units) - 1 :], units, strict=False):
         names = [name for name, own in zip(path.state_names, path.state_units, strict=True) if own == unit]
         for name, colour in style.assign_colours(names, LINE_COLOURS).items():
@@ -85,6 +88,7 @@ def plot_design(design: Design) -> Figure:
     times = [item.times for item in design.given.experiments[design.experiment].data]
     colours = style.assign_colours(design.shares, LINE_COLOURS)
     for when, (name, shares) in zip(times, design.shares.items(), strict=True):
+        # Filled where a sample is taken, empty where one might have been.
         taken = np.isin(when, design.sample_times.get(name, ()))
         axes[-1].vlines(when[taken], 0.0, shares[taken], color=colours[name], linewidth=LINE)
         axes[-1].plot(when[taken], shares[taken], "o", markersize=4, color=colours[name], label=name)

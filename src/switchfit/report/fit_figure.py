@@ -101,6 +101,7 @@ def plot_runs(
     """
     from matplotlib.patches import Patch
 
+    # Rows of experiments side by side; each row is as high as the one with the most outputs needs.
     runs = list(intervals)
     columns = min(max(len(runs), 1), RUNS_SIDE_BY_SIDE)
     blocks = [runs[first : first + columns] for first in range(0, len(runs), columns)]
@@ -124,6 +125,7 @@ def plot_runs(
     handles = style.collect_handles(figure.axes)
     named = {text.get_text() for ax in figure.axes for text in ax.texts}
     drawn = {mode for e in runs for mode, a, b in result.trajectories[e].mode_spans if b > a}
+    # Names stand above the modes where there is room for them; only the others need an entry in the legend.
     for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
         handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION_COLOUR, linewidth=0.5)
     # The notes are the title of the legend: a title of the figure would have the same place, and overlap with it.
@@ -143,6 +145,7 @@ def _draw_outputs(
 ) -> list[Axes]:
     """Draw each channel of an experiment with its residuals below, leaving rows free at the bottom for others only."""
     outputs, step = list_outputs(result, e), 2 if result.comparisons[e] else 1
+    # The same ratios in all experiments of a row, so that their panels are level, whether or not all are used.
     ratios = ([3.0, 1.2] if step == 2 else [1.0]) * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
     axes: list[Axes] = [block.add_subplot(grid[0])]

@@ -48,6 +48,7 @@ def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
     str
         Several lines without a newline at the end; the verdict first.
     """
+    # One layout with two sets of limits: nothing is left out of the full report.
     limits = dict.fromkeys(SCREEN, sys.maxsize) if full else SCREEN
     course = [*list_experiments(estimate, limits["experiments"]), *list_course(estimate)]
     channels = format_table(*tabulate_channels(estimate), most=limits["channels"], where=", of which more is explained")
@@ -69,6 +70,7 @@ def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
 def _describe_weak(estimate: Estimate, most: int) -> list[str]:
     """Return the combinations of unknowns that the data hardly determine, as lines."""
     found = estimate.identifiability
+    # Without convergence the curvature is not that of a minimum, and what it says of directions means little.
     weak = [d for d in found.directions if d.eigenvalue < WEAK] if estimate.status.successful else []
     return _list_sentences([write_direction(found, direction) for direction in weak], most, "direction")
 
@@ -83,5 +85,6 @@ def _list_sentences(sentences: Sequence[str], most: int, what: str) -> list[str]
 def _list_warnings(estimate: Estimate) -> list[str]:
     """Return the warnings that the verdict does not cover, as sentences."""
     reasons = {reason.kind for reason in estimate.verdict.reasons}
+    # Of two sentences on one thing, the verdict's is enough: it says what to do.
     covered = reasons.union(*(_COVERED.get(kind, set()) for kind in reasons))
     return [str(issue) for issue in find_issues(estimate) if issue.kind not in covered]

@@ -56,6 +56,7 @@ def list_experiments(fit: Fit, most: int) -> list[LabelledRow]:
         rows.append((name, ", ".join(filter(None, (sequence, span, jumps)))))
         data = [_format_data(comparison) for comparison in fit.comparisons[e]]
         rows += [("", text) for text in data or ["no data: a cost of the trajectory"]]
+        # Said once for runs that follow one another with the same origin. For the first one the slice is empty.
         if origins[e] and origins[e] not in origins[e - 1 : e]:
             rows.append(("times", origins[e]))
     if len(names) > most:
@@ -115,6 +116,7 @@ def list_quality(fit: Fit) -> list[LabelledRow]:
     fit : Fit
     """
     first = fit.initial_cost
+    # A fit without strategies has its first guess in the history.
     if np.isnan(first) and fit.history and not fit.steps:
         first = fit.history[0].cost
     guess = f"{first:.8g}" if np.isfinite(first) else "not integrable" if fit.steps else ""
@@ -126,6 +128,7 @@ def list_quality(fit: Fit) -> list[LabelledRow]:
     if np.isfinite(variance):
         priors = f" + {format_count(len(fit.priors), 'prior')}" if fit.priors else ""
         origin = f"2 J / ({fit.samples} values{priors} - {unknowns})"
+        # 2 J / (N - d) is sigma squared where sigma was not given, else chi-square by its degrees of freedom.
         name, meaning = "residual variance", f", so sigma is about {np.sqrt(variance):.4g}"
         if fit.sigma_known:
             name, meaning = "reduced chi-square", "; near 1 where sigma is right"
@@ -155,6 +158,7 @@ def tabulate_channels(fit: Fit) -> Table:
         rows.append([label, count, f"{comparison.rmse[k]:.4g}", unit, scaled, explained])
         shares.append(share)
     titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]
+    # NaN, of a channel that does not vary, is sorted to the end; equal ones keep their order.
     return Table([rows[k] for k in np.argsort(shares, kind="stable")], "<>><>>", titles)
 
 

@@ -54,10 +54,12 @@ def plot_fits(fits: Fits) -> Figure:
             f"{failed} runs that did not converge are left out" if failed else "",
         )
     else:
+        # Of many logs, those to look at: fits that are bad, not those in the middle.
         order = fits.worst_first[:DRAWN_FITS]
         draw, title = partial(_draw_rows, fits, order=order), selection.count_worst(order, fits, "fits")
         width, height, most = 2.9, 0.9 + 0.2 * max(len(order), 5), DRAWN_UNKNOWNS
         shown = select_unknowns_of_fits(fits, DRAWN_UNKNOWNS)
+    # A histogram of one estimate says nothing; the figure is empty then, with its title as the reason.
     if isinstance(fits, MonteCarlo | Bootstrap) and fits.success.sum() < 2:
         shown, title = [], TOO_FEW
     columns = max(min(len(shown), most), 1)
@@ -69,6 +71,7 @@ def plot_fits(fits: Fits) -> Figure:
         if number % columns:
             panel.set_ylabel("")
             panel.tick_params(labelleft=False)
+    # All panels have the same entries.
     figure.draw_legend(style.collect_handles(axes[:1]), most=3, loc="outside upper center", title=title)
     return style.turn_off_formulas(figure)
 
@@ -84,6 +87,7 @@ def _draw_rows(fits: Fits, k: int, ax: Axes, *, order: NDArray[np.intp]) -> None
     theta = fits.theta[order, k, None]
     size = np.abs(intervals - theta)
     known = size[(size > 0) & (size < np.inf)]
+    # Intervals go on beyond the axis, and are cut off there.
     if len(known) and known.max() > (most := FARTHEST * np.median(known)):
         near = np.where(size <= most, intervals, theta)
         margin = 0.05 * (np.nanmax(near) - np.nanmin(near))
@@ -117,6 +121,7 @@ def _draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> None:
 def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bool = False) -> None:
     """Draw the histogram of the estimates of unknown k: all but the farthest hundredth, with a margin."""
     values = study.theta[study.success, k]
+    # A fit that ended in another minimum would make all others one bar.
     low, high = np.percentile(values, [0.5, 99.5])
     margin = 0.25 * max(float(high - low), 1e-12 * abs(centre), np.finfo(float).tiny)
     limits, label = (low - margin, high + margin), f"{len(values)} estimates"

@@ -47,6 +47,7 @@ def write_fits(fits: Fits) -> str:
         *tables.wrap_text(str(fits.verdict)),
         f"{format_count(count, 'fit')} in {fits.seconds:.1f} s {each}, {good} converged",
     ]
+    # By how often each status occurs.
     endings = Counter(fits.status.tolist()).most_common()
     lines += format_table([(str(number), name) for name, number in endings], "><", indent="    ")
     if good < count:
@@ -95,6 +96,7 @@ def tabulate_minima(study: Multistart) -> tuple[Table, str]:
     rows, clocks = [], list_dated(study)
     shown = select_unknowns_of_fits(study, LISTED_PLACES)
     for k in range(min(count_minima(study), LISTED_COST_MINIMA)):
+        # Clusters are numbered by their cost, the lowest first; its first start stands for where it is.
         here = np.flatnonzero(study.clusters == k)
         places = []
         for i in shown:
@@ -108,6 +110,7 @@ def tabulate_minima(study: Multistart) -> tuple[Table, str]:
 
 def select_unknowns_of_fits(fits: Fits, most: int) -> list[int]:
     """Return the indices of the unknowns that are listed, at most so many."""
+    # Names of several runs have the run before the point: `run_2.tau_1`.
     is_time = [name.rsplit(".", 1)[-1].startswith("tau_") for name in fits.theta_names]
     return selection.select_unknowns(is_time, most)
 
@@ -124,6 +127,7 @@ def tabulate_monte_carlo(study: MonteCarlo) -> tuple[Table, str]:
     if count < 2:
         return Table([], ""), TOO_FEW
     spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
+    # The middle of the standard errors that the fits report, to be compared with the spread of their estimates.
     reported = np.median(study.standard_errors[study.success], axis=0)
     rows, shown, clocks = [], select_unknowns_of_fits(study, LISTED_UNKNOWNS), list_dated(study)
     for i in shown:
@@ -146,6 +150,7 @@ def tabulate_bootstrap(study: Bootstrap) -> tuple[Table, str]:
     for k in shown:
         ends = ", ".join(format_time(end, clocks[k], error[k]) for end in intervals[k])
         spread = f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends}]"
+        # An unknown of one run alone does not vary if whole runs are drawn: its spread would be 0, which is wrong.
         spread = spread if study.resampled[k] else ("-", "-", "of one run alone")
         rows.append((_label(study, k), format_time(study.estimate[k], clocks[k], error[k]), *spread))
     titles = ("", "estimate", "bias", "standard error", "95 % interval (BCa)")

@@ -54,6 +54,7 @@ def _describe_unknowns(estimate: Estimate) -> Frame:
     joins = {transition.index: f"{transition.before} -> {transition.after}" for transition in estimate.transitions}
     columns: dict[str, Any] = {
         "value": estimate.theta,
+        # A standard error of 0 says that an unknown was held, by a bound or a kink: as a number, it would be believed.
         "std_error": np.where(naive == 0, np.nan, correct_errors(estimate)),  # held
         "low": low,
         "high": high,
@@ -65,6 +66,7 @@ def _describe_unknowns(estimate: Estimate) -> Frame:
         "transition": [joins.get(i, "") for i in range(len(names))],
         "held": ["; ".join(list_holds(estimate, name)) for name in names],
     }
+    # Columns of dates only where there are any; ISO 8601 with the zone, as text, since zones may differ by run.
     if any(run is not None for run in dated):
         for name, times in {"date": estimate.theta, "date_low": low, "date_high": high}.items():
             columns[name] = ["" if run is None else format_iso(t, run) for t, run in zip(times, dated, strict=True)]
@@ -105,6 +107,7 @@ def _describe_residuals(estimate: Estimate) -> Frame:
     """Return a row for each value that was measured, in the order of runs, data and channels."""
     parts: list[dict[str, NDArray[Any]]] = []
     for _, e, comparison, k in list_channels(estimate.comparisons, estimate.run_names):
+        # Missing values have no residual, and no row.
         i = np.flatnonzero(np.isfinite(comparison.measured[:, k]))
         sigma = np.full(len(i), np.nan) if comparison.sigma is None else comparison.sigma[i, k]
         part: dict[str, NDArray[Any]] = {
@@ -130,6 +133,7 @@ def _describe_history(fit: Fit) -> Frame:
     kinds = {"iteration": np.int64, "cost": float, "optimality": float, "step": float, "evaluations": np.int64}
     columns = {name: np.array([getattr(r, name) for r in fit.history], dtype=kind) for name, kind in kinds.items()}
     index, *others = _list_columns(columns)
+    # A history may be empty: its table then has no rows, but the same columns.
     theta = np.array([record.theta for record in fit.history]).reshape(-1, len(fit.theta_names))
     return Frame((index,), (*others, *_split(theta, fit.theta_names, fit.theta_units)))
 
@@ -139,6 +143,7 @@ def _list_dates(result: Trajectory | Prediction) -> list[Column]:
     origin = result.origin
     if origin is None:
         return []
+    # Rounded to microseconds, to which dates are known; nanoseconds would show the rounding of doubles.
     microseconds = 1e6 * SECONDS_OF_UNIT[normalize_time_unit(result.time_unit)] * result.times
     values = origin.instant + np.round(microseconds).astype("timedelta64[us]")
     return [Column("date (UTC)" if origin.time_zone else "date", values.astype("datetime64[ns]"))]

@@ -34,6 +34,7 @@ def write_insertion(found: Insertion) -> str:
         speed = f"{-pulses[0].rate:.4g} per {run.time_unit} of its length"
         text = f"A short pulse of {pulses[0].mode} at {at} lowers J fastest: by {speed}."
     for pulse in pulses:
+        # At a transition a time stands twice: the mode after it is interrupted, as the pulse begins there.
         interrupted = found.modes[int(found.active[np.flatnonzero(found.times == pulse.time)[-1]])]
         rows.append((pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", interrupted))
     table = format_table(rows, "<>><", ["mode", label_time(run, "time"), "dJ / d length", "in"])

@@ -17,6 +17,7 @@ _BOUND = "{names} is at its {kind} {value:g}: it has no standard error, and thos
 @format_text.register(Issue)
 def write_issue(issue: Issue) -> str:
     """Return an issue as a sentence or two."""
+    # Kinds that only a verdict has are parts of sentences there; here they stand alone, and end with a point.
     if issue.kind in _ISSUES:
         return write_sentence(_ISSUES[issue.kind], issue)
     if issue.kind in REASONS:

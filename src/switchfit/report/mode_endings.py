@@ -78,6 +78,8 @@ def name_criterion(name: str) -> str:
 def _is_exchanged(ending: ModeEnding) -> bool:
     """Return whether the other sequence is the best one with its modes renamed, and as good but for rounding."""
     each = list(zip(ending.sequences, ending.other, strict=True))
+    # A renaming is a bijection of modes: no two pairs share a side. Equal costs are needed as well, since any two
+    # sequences of two modes are renamings of each other.
     pairs = {pair for best, other in each for pair in zip(best, other, strict=False)}
     same_lengths = all(len(best) == len(other) for best, other in each)
     renamed = len({best for best, _ in pairs}) == len({other for _, other in pairs}) == len(pairs)
@@ -107,11 +109,13 @@ def write_ending(ending: ModeEnding) -> str:
     ----------
     ending : ModeEnding
     """
+    # All that any of the sentences may name; each takes what it needs.
     fields = vars(ending) | {
         "best": _join_sequence(ending.sequences),
         "other": _join_sequence(ending.other),
         "criterion": name_criterion(ending.criterion),
         "other_criterion": name_criterion(ending.prefers_other),
+        # Alternatives are compared by the mBIC, which prices a switch as searching for it costs.
         "compared": name_criterion("mbic" if ending.criterion == "bic" else ending.criterion),
         "most": format_count(ending.limit, "switch", "switches"),
         "why": _UNLIKELY.get(ending.reason, _UNLIKELY["correlated residuals"]).format(ending.probability),

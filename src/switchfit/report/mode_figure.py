@@ -57,10 +57,13 @@ def _plot_numbers(search: ModeSearch, ax: Axes) -> None:
     for name, label in list_criteria(search).items():
         values = np.array([getattr(fit, name) for fit in search.fitted])
         if np.isfinite(values).any():
+            # Each criterion has a zero of its own; only differences mean something. Infinite ones are sequences that do
+            # not fit.
             above = values - np.nanmin(np.where(np.isfinite(values), values, np.nan))
             ax.plot(numbers, above, "o-", color=colours[name], linewidth=LINE, markersize=4, label=label)
     if search.chosen:
         ax.axvline(search.chosen[0].switches, color=FIT_COLOUR, linewidth=THIN, zorder=0)
+    # Linear where models compete, to 10 above the lowest; logarithmic for the thousands of those that miss a switch.
     ax.set_yscale("symlog", linthresh=10.0)
     ax.set_ylim(bottom=-1.0)
     ax.set_xlabel("number of switches")

@@ -54,6 +54,7 @@ def write_search(search: ModeSearch) -> str:
     if not search.chosen:
         return "\n".join(head)
     head += [line for warning in search.warnings for line in wrap_text(str(warning), "- ", "  ")]
+    # Said only where it makes a difference.
     corrected = fit is not None and not np.array_equal(correct_errors(fit), fit.standard_errors, equal_nan=True)
     best = _list_segments(search), _list_parameters(search), [ALLOWED] if corrected else []
     alternatives = _list_alternatives(search) if len(search.chosen) > 1 else []
@@ -76,9 +77,11 @@ def tabulate_segments(
 def _list_segments(search: ModeSearch) -> list[str]:
     """Return a line for each segment of the best: mode, from, to, and the standard error of where it begins."""
     best, fit, lines = search.chosen[0], search.best, []
+    # An index of -1, of a time that was not estimated, finds the NaN behind the last.
     errors = np.append([] if fit is None else correct_errors(fit), np.nan)  # the last: not estimated
     for e, (sequence, times) in enumerate(zip(best.sequences, search.transition_times, strict=True)):
         places = np.full(len(times), -1) if fit is None else fit.transition_places[e][: len(times)]
+        # A search without a fit, as one that was interrupted, has no trajectory to take the dates from.
         run = times_module.Clock(None if fit is None else fit.trajectories[e].origin, search.time_units[e])
         ends = [format_time(time, run, 0.0) for time in (search.starts[e], search.ends[e])]
         lines += [f"{search.run_names[e]}:"] if len(best.sequences) > 1 else []
@@ -105,6 +108,7 @@ def _tabulate_numbers(search: ModeSearch) -> list[str]:
     for fit in search.fitted:
         cells = ["*" if fit.sequences == search.chosen[0].sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
         for name, title in criteria.items():
+            # A criterion of the user's own may have any size; those of likelihoods are compared to a tenth.
             digits = ".8g" if name == "criterion" and title != DISCOUNTED else ".1f"
             cells.append(f"{getattr(fit, name):{digits}}".replace("nan", ""))
         rows.append((fit, cells))

@@ -37,6 +37,7 @@ def write_comparison(found: ModelComparison) -> str:
 def _write_best(found: ModelComparison) -> str:
     """Return which model has the smallest BIC and how strong that evidence is, or which models are equally good."""
     order = _list_best_first(found)
+    # To the digits that are shown: two models with 0.0 between them, of which one is called better, would puzzle.
     best = [k for k in order if found.delta_bic[k] < EQUAL_BIC_DIFFERENCE]
     are_best = "has the smallest BIC" if len(best) == 1 else "are as good as each other by BIC"
     text = f"{join_words([found.names[k] for k in best])} {are_best}"

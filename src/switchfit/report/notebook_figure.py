@@ -61,6 +61,7 @@ class NotebookFigure(Figure):
         settings
             Others of ``Figure.legend``.
         """
+        # matplotlib cannot wrap the columns of a legend by itself: too many of them run out of the figure.
         look = fit_legend(list(handles), self.get_figwidth(), most, rcParams["legend.fontsize"])
         self.legend_settings = {"handles": handles, "most": most, **settings}
         self.legend_drawn = self.legend(list(handles.values()), list(handles), **look, **settings)
@@ -69,5 +70,6 @@ class NotebookFigure(Figure):
         """Set the size in inches, and draw the legend in the columns that it has room for."""
         super().set_size_inches(w, h, forward)
         if self.legend_drawn is not None and self.legend_drawn in self.legends:
+            # Its entries and settings are remembered, since a legend does not tell all of them.
             self.legend_drawn.remove()
             self.draw_legend(**self.legend_settings)

@@ -26,9 +26,11 @@ def format_rounded(value: float, error: float) -> tuple[str, str, str]:
     last = 1 - _find_exponent(error)  # decimal place of the second digit of the error
     if value != 0.0:
         last = max(last, 1 - _find_exponent(value))
+    # A ratio to a value near 0 is large and says nothing.
     relative = f"({100 * error / abs(value):.2g} %)" if abs(value) > error / 10 else ""
     if 1e-4 <= max(abs(value), error) < 1e7:
         return f"{value:.{max(last, 0)}f}", f"± {error:.{max(last, 0)}f}", relative
+    # The same decimal place, counted from the first digit of the value.
     digits = max(last + _find_exponent(value), 1) if value != 0.0 else 1
     return f"{value:.{digits}e}", f"± {error:.1e}", relative
 

@@ -72,6 +72,7 @@ def _list_values(log: OnlineLog) -> list[tuple[str, str, FloatArray, FloatArray]
     for name, errors in log.standard_errors.items():
         unit = log.units[name]
         for k, index in enumerate(np.ndindex(errors.shape[1:])):
+            # A parameter with several entries has a row for each: its history is (K, *shape).
             label = f"{name}[{k}]" if errors[0].size > 1 else name
             found.append((label, unit, log.parameters[name][:, *index], errors[:, *index]))
     return found
@@ -113,6 +114,7 @@ def plot_log(log: OnlineLog) -> Figure:
     stack_probabilities(log.times, log.modes, log.probability, axes[0])
     now = log.now
     reach = QUANTILE * now.time_errors
+    # Intervals of the last answer: earlier ones are in the log, but the last has seen most.
     ends = np.stack([now.transition_times - reach, now.transition_times + reach], axis=1)
     panels.plot_transitions(now.transition_times, ends, axes[0])
     _plot_statistic(log, axes[1])
@@ -132,6 +134,7 @@ def _plot_statistic(log: OnlineLog, ax: Axes) -> None:
         face = "none" if alarm in log.retracted else FIT_COLOUR
         ax.plot(alarm.time, alarm.statistic, "o", markersize=4, color=FIT_COLOUR, markerfacecolor=face)
     style.draw_level(ax, "threshold", log.threshold, "left")
+    # Linear up to the threshold, where it is read; a real change goes on to thousands.
     if np.max(log.statistic) > LOG_AXIS_FROM_THRESHOLDS * log.threshold:
         ax.set_yscale("symlog", linthresh=log.threshold, linscale=2.0)
     ax.set_ylim(0.0, max(1.5 * log.threshold, ax.get_ylim()[1]))
@@ -142,6 +145,7 @@ def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axe
     """Draw a parameter with its 95 % band, which is cut off where it is much wider than at the end."""
     band = np.stack([value - QUANTILE * error, value + QUANTILE * error], axis=1)
     ax.plot(times, value, "-", color=FIT_COLOUR, linewidth=LINE, zorder=3)
+    # In the beginning a parameter is not known at all, and its band would make the curve a straight line.
     reach = 3.0 * QUANTILE * np.nan_to_num(error[-1], posinf=0.0)
     ax.set_ylim(*ax.get_ylim() + reach * np.array([-1.0, 1.0]))
     ax.set_autoscaley_on(False)

@@ -95,6 +95,8 @@ def plot_modes(
     """
     colours = choose_mode_colours([trajectory]) if colours is None else colours
     spans = trajectory.mode_spans
+    # A letter of small text is about 0.085 inches wide: a name that is wider than its mode is turned, and one without
+    # any room is left out.
     inches = ax.bbox.width / ax.figure.dpi
     for mode, begin, end in (span for span in spans if span[2] > span[1]):
         ax.axvspan(begin, end, color=colours[mode], linewidth=0, zorder=0)
@@ -150,6 +152,7 @@ def list_outputs(result: Fit | Validation, e: int) -> list[tuple[Comparison, int
     """
     own, none = result.trajectories[e], result.trajectories[e].states[:0]
     units = own.state_units
+    # Without data the states are drawn as if they were outputs, so that one path draws both.
     states = Comparison("states", own.state_names, own.times[:0], none, none, None, own.times, own.states, units=units)
     return [(data, k) for data in result.comparisons[e] or (states,) for k in range(len(data.names))]
 
@@ -170,6 +173,7 @@ def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about_
     about_zero : bool, optional
         Draw them about the zero of the residuals, since about the curve they are often too narrow to be seen.
     """
+    # Bands are wider than residuals where the model is uncertain: limits grow with them, and do not shrink.
     e, order, limits = prediction.experiment, np.argsort(prediction.times, kind="stable"), ax.get_ylim()
     late = find_delay(list_outputs(prediction.fit, e)[k][0], prediction.fit.trajectories[e])
     bands = [
@@ -247,5 +251,6 @@ def replace_infinities(values: FloatArray) -> FloatArray:
 
 def _break_at_transitions(times: FloatArray, *values: FloatArray) -> list[FloatArray]:
     """Return times and values with a gap at each transition, whose time stands there twice: curves may jump there."""
+    # A NaN between the two: matplotlib breaks a line there, and a band as well.
     inner = np.flatnonzero(np.diff(times) == 0) + 1
     return [np.insert(times, inner, times[inner]), *(np.insert(each, inner, np.nan) for each in values)]

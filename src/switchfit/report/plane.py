@@ -34,6 +34,7 @@ def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | 
     parts = [re.findall(r"[^\W\d_]+", name.lower()) for name in names]
     for k, one in enumerate(parts):
         for pair in PAIRS if units[k] in LENGTH_UNITS and not NO_POSITIONS & set(one) else ():
+            # The partner's name has y where this one has x, as a part: pos_x and pos_y, but not max and may.
             other = [pair.get(part, part) for part in one]
             if other != one and other in parts and units[parts.index(other)] == units[k]:
                 return k, parts.index(other)
@@ -67,10 +68,12 @@ def plot_plane(
     x, y = comparison.measured[:, plane].T
     draw_measured(comparison, x, y, ax)
     colours = choose_mode_colours([trajectory], lines=True)
+    # A curve for each mode, from its first node to its last: the nodes at a transition are two.
     segments = zip(trajectory.mode_spans, trajectory.segments[:-1], trajectory.segments[1:], strict=True)
     for (mode, begin, end), first, last in segments:
         label = f"fitted: {mode}" if end > begin else ""
         ax.plot(*comparison.curve[first:last, plane].T, color=colours[mode], linewidth=2 * LINE, zorder=4, label=label)
+    # The last node before each transition: what is measured may jump there.
     ends = comparison.curve[trajectory.segments[1:-1] - 1][:, plane]
     if len(ends):
         marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA_COLOUR, "markersize": 6, "linestyle": "none"}

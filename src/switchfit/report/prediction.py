@@ -35,6 +35,7 @@ def plot_prediction(prediction: Prediction, *, level: float = 0.95) -> Figure:
         ax.plot(times + late, values[order, number], "-", color=FIT_COLOUR, linewidth=LINE, zorder=4, label="predicted")
         panels.draw_measured(comparison, comparison.times, comparison.measured[:, k], ax)
         panels.plot_modes(trajectory, ax, labels=ax is axes[0])
+        # The forecast goes on in the last mode, whose colour is drawn on up to its end.
         if times[-1] > end:
             colour = panels.choose_mode_colours([trajectory])[trajectory.mode_spans[-1][0]]
             ax.axvspan(end, times[-1], color=colour, linewidth=0, zorder=0)

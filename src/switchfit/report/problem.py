@@ -69,6 +69,7 @@ def write_experiments(experiments: Sequence[Experiment], *, full: bool = False) 
 
 def _describe_experiment(experiment: Experiment) -> list[str]:
     unit = times_module.suffix_time(experiment)
+    # Also where the times are unknown: at the first guess.
     ends = experiment.ends_of_modes(experiment.initial_times)
     start, *times, end = (format_time(time, experiment) for time in ends)
     sequence = f"{' -> '.join(experiment.mode_sequence)} on [{start}, {end}]{unit}"
@@ -92,6 +93,7 @@ def _describe_data(item: Data, experiment: Experiment) -> str:
     if not isinstance(item, Measurements):
         return type(item).__name__
     unit = unit_suffix(experiment.time_unit)
+    # The usual distance: logs with gaps have another mean.
     step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
     named = sorted({name for name in item.sigma_names if name})
     said = [

@@ -81,6 +81,7 @@ def _list_profile_notes(profile: Profile) -> Iterator[str]:
         yield _NARROW.format(profile.widening)
     for a, b in (region for region in profile.regions() if region != (low, high)):
         yield f"the data allow values from {show(a)} to {show(b)} as well: there is another minimum"
+    # A profile may find a lower minimum than the fit: then its interval is about the wrong value.
     better = profile.lower_cost
     if better is not None:
         where = f"{profile.name} = {show(better[profile.fit.theta_names.index(profile.name)])}"
@@ -106,8 +107,10 @@ def plot_profile(profile: Profile, *, ax: Axes | None = None) -> Axes | Figure:
     ax : matplotlib.axes.Axes, optional
     """
     (drawn, ax), regions = style.open_axes(ax), profile.regions()
+    # Half as high again as the threshold; points far above it, of a wide scan, would flatten the curve.
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
     values, ratio = profile.values, profile.zeta**2
+    # One more point on each side, so that the curve leaves the figure through its upper edge.
     near = np.flatnonzero(ratio <= top)
     first, last = max(near[0] - 1, 0), min(near[-1] + 1, len(values) - 1)
     edges = [edge for region in regions for edge in region if np.isfinite(edge)]

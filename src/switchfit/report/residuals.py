@@ -65,6 +65,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = MOST_DRAWN_CH
     """
     shown = list(zip(diagnostics.labels, diagnostics.channels, strict=True))
     if len(shown) > most:
+        # By what they do to the standard errors, not by a test, which a long log fails for trifles.
         shown = sorted(shown, key=lambda pair: pair[1].widening, reverse=True)[:most]
     figure = style.make_figure(10.5, 0.5 + 2.5 * max(len(shown), 1))
     if not shown:
@@ -101,6 +102,7 @@ def _draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> None:
     lags = np.arange(1, len(channel.autocorrelation) + 1)
     ax.vlines(lags, 0.0, channel.autocorrelation, color=FIT_COLOUR, linewidth=LINE)
     ax.plot(lags, channel.autocorrelation, "o", color=FIT_COLOUR, markersize=4)
+    # Never less than twice the limits: correlations that are noise look small.
     reach = max(1.3 * float(np.max(np.abs(channel.autocorrelation), initial=0.0)), 2 * limit)
     ax.set_ylim(-min(reach, 1.05), min(reach, 1.05))
 
@@ -108,6 +110,7 @@ def _draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> None:
 def _draw_quantiles(channel: ChannelResiduals, ax: Axes) -> None:
     """Draw sorted standardised residuals against quantiles of the normal distribution: a straight line if normal."""
     n = len(channel.values)
+    # Plotting positions (k - 1/2)/n.
     expected = special.ndtri((np.arange(1, n + 1) - 0.5) / n)
     ax.plot(expected[[0, -1]], expected[[0, -1]], "-", color=FIT_COLOUR, linewidth=THIN)
     ax.plot(expected, np.sort(channel.values), "o", color=TRANSITION_COLOUR, markersize=3, markeredgewidth=0)

@@ -27,6 +27,7 @@ def select_unknowns(is_time: Sequence[bool], most: int, marked: Collection[int] 
     most : int
     marked : collection of int, optional
     """
+    # Sorted twice: by rank to choose, then by place to list them in the order of theta.
     few = 2 * sum(is_time) <= most
     return sorted(sorted(range(len(is_time)), key=lambda i: (i not in marked, is_time[i] != few))[:most])
 

@@ -20,6 +20,8 @@ def format_share(share: float) -> str:
         return "none"
     if 1 - share < 1e-6:
         return "all but 1e-6" if share < 1 - 1e-12 else "all"
+    # As many digits as there are nines: 99.97 % and 99.998 % differ by what they leave. Rounded down, since 100.0 %
+    # would be a claim.
     digits = 0 if share < 0.9 else max(int(np.ceil(-np.log10(1 - share))) - 1, 1)
     scaled = share * 10 ** (digits + 2)
     return f"{np.floor(scaled + 1e-9 * scaled) / 10**digits:.{digits}f} %"  # 0.29 * 100 is below 29

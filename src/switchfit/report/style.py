@@ -76,6 +76,7 @@ def open_axes(ax: Axes | None, size: tuple[float, float] = (6.4, 4.2)) -> tuple[
     """
     from matplotlib.axes import Axes
 
+    # A figure without pyplot: nothing is left in its list of open figures, and no window is opened.
     if ax is None:
         figure = make_figure(*size)
         return figure, figure.subplots()
@@ -147,6 +148,7 @@ def label_axis(ax: Axes, run: Timed, name: str = "time") -> None:
     if run.origin is not None:
         from switchfit.report.date_axis import DateFormatter, DateLocator
 
+        # Ticks alone: positions on the axis stay numbers, so that what is drawn with it needs no dates.
         locator = DateLocator(run.origin, run.time_unit)
         ax.xaxis.set_major_locator(locator)
         ax.xaxis.set_major_formatter(DateFormatter(locator))
@@ -188,6 +190,7 @@ def turn_off_formulas(drawn: Drawn) -> Drawn:
     from matplotlib.text import Text
 
     for text in drawn.findobj(Text):
+        # Labels that matplotlib writes itself, such as powers of ten, must stay formulas.
         if "$" in text.get_text() and "\\mathdefault" not in text.get_text():  # as in ticks of matplotlib's own
             text.set_parse_math(False)
     return drawn

@@ -52,6 +52,7 @@ def format_table(
     where : str, optional
         Where the others are, behind their number.
     """
+    # Widths are those of the rows that are shown; a column without any entry takes no room.
     shown = rows[:most]
     columns, written = Table(shown, alignment).columns, [titles, *shown] if titles and rows else shown
     widths = {k: max(len(row[k]) for row in written) for k in columns}

@@ -66,6 +66,7 @@ def write_sentence(sentence: Sentence, issue: Issue) -> str:
     """
     if callable(sentence):
         return sentence(issue)
+    # Only the fields that the template has are looked up: a word may need figures that other issues lack.
     names = [name for _, name, *_ in Formatter().parse(sentence) if name and not name.isdigit()]
     fields = {name: _WORDS[name](issue) if name in _WORDS else get_figure(issue, name) for name in names}
     return sentence.format(*issue.subjects, **fields)
@@ -110,6 +111,7 @@ def write_undefined(issue: Issue) -> str:
     t = f"t = {get_figure(issue, 't'):.6g}, " if "t" in issue.figures else ""
     lacks = "derivatives" if get_figure(issue, "valued") else "value"
     function = f"{role}{f' of {run}' if run else ''} has no finite {lacks}{f' at {t}x = {x}' if x else ''}"
+    # Order 0 is the function itself, 1 and 2 are its derivatives, which are needed for gradient and Hessian.
     which = ("", "the derivative of ", "the second derivative of ")[int(get_figure(issue, "order"))]
     return f"{function}: {which}{operation}{f' at {line}' if line else ''} is not finite"
 

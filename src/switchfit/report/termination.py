@@ -67,9 +67,11 @@ def write_kink(kink: Kink) -> str:
 def write_termination(ended: Termination) -> str:
     """Return how a fit ended, with its numbers, what to do next, and the active constraints."""
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
+    # A flat direction that has only unknowns that nothing reads is no question of data: it is a mistake in the model.
     flat = {name for name, _ in ended.flat_direction}
     only_unread = ended.status is Status.SINGULAR and flat and flat <= {*ended.unread, *ended.absent}
     template = _FIT_ENDINGS["only unread" if only_unread else ended.status]
+    # Some reasons are said by the sentence of the status; one that is not must not get lost.
     if "{reason}" not in template and ended.reason is not None and ended.reason.kind in WRITTEN_OTHERWISE:
         template += "{reason}"
     return template.format(**vars(ended) | _describe_ending(ended)) + active

@@ -33,6 +33,7 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
     trajectories, colours = [estimate.trajectories[e] for e in runs], choose_mode_colours(estimate.trajectories)
     first = float(min(run.times[0] for run in trajectories))
     last = float(max(run.times[-1] for run in trajectories))
+    # Inches of a unit of time: a name is written into its bar where it fits, else it is in the legend.
     inches = ax.bbox.width / ax.figure.dpi / (last - first)
     for row, (e, run) in enumerate(zip(runs, trajectories, strict=True)):  # the first on top
         for mode, begin, end in (span for span in run.mode_spans if span[2] > span[1]):

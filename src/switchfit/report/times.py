@@ -89,6 +89,8 @@ def format_date(date: datetime.datetime, error: float, *, short: bool = False) -
         ((s, form) for s, form in DATE_PLACES if error >= LEAST_ERROR_IN_LAST_PLACES * s), (0.0, " %H:%M:%S.%f")
     )
     digits = 0 if seconds else min(max(int(np.ceil(-np.log10(max(error, 1e-6) / LEAST_ERROR_IN_LAST_PLACES))), 1), 6)
+    # Half of the last place is added, and the rest cut off: rounding, which may carry into the next day. Days alone are
+    # not rounded: noon belongs to its day.
     half = 0.0 if form == "" else 0.5 * (seconds or 10.0**-digits)
     rounded = date.replace(tzinfo=None) + datetime.timedelta(seconds=half)
     text = rounded.strftime(form)
@@ -139,6 +141,7 @@ def list_dated(result: Fit | Problem | Fits) -> list[Timed | None]:
     else:
         places = map(np.append, result.transition_places, result.final_places)
         pairs = zip(result.trajectories, places, strict=True)
+    # Places of -1 are times that are known.
     found: list[Timed | None] = [None] * len(result.theta_names)
     for run, own in pairs:
         for place in own[own >= 0].tolist() if run.origin is not None else ():
@@ -148,6 +151,7 @@ def list_dated(result: Fit | Problem | Fits) -> list[Timed | None]:
 
 def _tell_apart(date: datetime.datetime) -> str:
     """Return the offset from UTC of a date that the clocks of its zone show twice; "" for any other."""
+    # Both foldings of the hour that is repeated in autumn have the same text but for the offset.
     if date.tzinfo is None or date.replace(fold=0).utcoffset() == date.replace(fold=1).utcoffset():
         return ""
     return f"{date:%z}"
@@ -166,6 +170,7 @@ def describe_clock(run: Timed) -> dict[str, Any] | None:
     if run.origin is None:
         return None
     named, zone = run.origin.time_zone, run.origin.zone
+    # A fixed offset is a `datetime.timezone`; a named zone has no offset without a date.
     offset = zone.utcoffset(None) if isinstance(zone, datetime.timezone) else None
     shift = 0.0 if offset is None else 1e3 * offset.total_seconds()
     length = 1e3 * SECONDS_OF_UNIT[normalize_time_unit(run.time_unit)]

@@ -74,10 +74,12 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         name, run = fit.theta_names[i], dated[i]
         value, error, relative = format_rounded(fit.theta[i], np.nan if name in fit.idle else errors[i])
         plain = format_rounded(fit.theta[i], np.nan if name in fit.idle else naive[i])[1]
+        # The number beside the date: bounds and arguments are given in numbers.
         counted = "" if run is None else f"t = {value}"
         if run is not None:
             value, relative = format_time(fit.theta[i], run, errors[i]), ""
         low, high = (format_end(end, wide[i], run) for end in wide[i])
+        # Shorter and longer side of the interval, about the estimate.
         sides = np.sort(np.abs(wide[i] - fit.theta[i]))
         # At a kink a profile may be narrower than the standard error says.
         usual = fit.quantile(0.95) * errors[i] if name in kinks and errors[i] > 0 else sides[0]
@@ -112,6 +114,7 @@ def format_end(end: float, ends: FloatArray, run: Timed | None) -> str:
     run : Timed or None
         What this is a time of; None for what is no time.
     """
+    # The digit is chosen by the width, not by the end: both ends of an interval have the same places.
     width = ends[1] - ends[0]
     if not (np.isfinite(end) and np.isfinite(width) and width > 0):
         return ""
@@ -166,6 +169,7 @@ def tabulate_correlations(fit: Fit) -> Table:
     fit : Fit
     """
     correlation = np.nan_to_num(np.tril(fit.correlation, -1))
+    # The lower triangle, each pair once.
     above = np.argwhere(np.abs(correlation) > SMALL_CORRELATION)
     above = above[np.argsort(-np.abs(correlation[tuple(above.T)]), kind="stable")]
     names = fit.theta_names

@@ -31,6 +31,7 @@ def write_validation(found: Validation) -> str:
     known = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
     for (name, value, error, unit), run in zip(known, times.list_dated(found.problem), strict=True):
         shown, spread = times.format_estimate(float(value), float(error), run)
+        # Three origins: kept from the fit, this run's own, or given and not estimated.
         origin = "estimated from this run" if name in refit else "as given"
         origin = "kept from the fit" if name in found.kept else origin
         rows.append([name, shown, spread if spread != "held" else "", unit, origin])
@@ -77,6 +78,7 @@ def plot_validation(found: Validation, *, level: float = 0.95) -> Figure:
     intervals = {e: _find_intervals(found, e, level) for e in runs}
     figure = fit_figure.plot_runs(found, intervals, dict(enumerate(found.predictions)), level=level, label="predicted")
     for e, block in enumerate(figure.subfigs):
+        # Every other panel has residuals. A run without data has no fit to be written.
         for panel, (comparison, k) in zip(block.axes[::2], panels.list_outputs(found, e), strict=False):
             text = f"fit {convert_to_percent(explain_channel(comparison, k)):.1f} %"
             panel.annotate(text, (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=SMALL)

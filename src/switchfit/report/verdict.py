@@ -123,6 +123,7 @@ def write_step(step: Issue) -> str:
         return suggest_definition(step.subjects[1])
     kind = step.kind.removeprefix("next: ")
     text = _STEPS.get(kind, kind).format(*step.subjects, names=name_first(step.subjects))
+    # A sentence about several unknowns, said of one.
     return text.replace("one of them", "it") if len(step.subjects) == 1 else text
 
 
@@ -147,6 +148,7 @@ def _write_looks(issue: Issue) -> str:
 def _write_wrong_model(issue: Issue) -> str:
     """Return that what is left of the data is no noise, what is wrong then, and what it does to standard errors."""
     widening, size = get_figure(issue, "narrowing"), get_figure(issue, "size")
+    # Correlation is the graver finding: it changes standard errors, while a size may be that of a wrong sigma.
     left, errors = f"is {size:.2g} sigma", ""
     if get_figure(issue, "correlated"):
         left, errors = "is correlated", f" (standard errors too small by a factor of {widening:.2g})"
@@ -157,6 +159,7 @@ def _write_wrong_model(issue: Issue) -> str:
 
 
 def _write_ending(issue: Issue) -> str:
+    # Status, and why the line search failed, if it did.
     status, kind = (*issue.subjects, "", "")[:2]
     text = f"{_UNCONVERGED.get(status, 'not converged')} {_SEARCHES.get(kind, '')}".rstrip()
     return write_sentence(text, issue)

@@ -27,6 +27,7 @@ def get_figure(issue: Issue, name: str) -> float:
     name : str
     """
     value = issue.figures.get(name, np.nan)
+    # NaN, and no error: a sentence with a gap is better than no report.
     return np.nan if isinstance(value, tuple) else value
 
 

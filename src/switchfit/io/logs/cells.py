@@ -11,7 +11,9 @@ from switchfit.problem.dates import read_date_text
 MISSING = frozenset({"", "NA", "N/A", "NAN", "NULL", "NONE"})
 """Cells that stand for a missing value, in capitals."""
 
+# Either mark of decimals: which one a file uses is decided for all of its cells together.
 DECIMAL_NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
+# Loose on purpose: this tells dates from numbers, and `read_date_cell` says whether one can be read.
 _DATE = re.compile(r"\d{4}[-/]\d{1,2}[-/]\d{1,2}.*|\d{1,2}[./]\d{1,2}[./]\d{4}.*|\d{8}T.*")
 CLOCK_TIME = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?")
 _GERMAN = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")
@@ -40,6 +42,8 @@ def read_date_cell(cell: str) -> tuple[np.datetime64, str] | None:
 
     Dates without a zone are counted as if they were UTC.
     """
+    # To ISO 8601: day.month.year turned round, slashes and decimal commas replaced, and digits that it wants twice
+    # filled up.
     text = _GERMAN.sub(r"\3-\2-\1", cell).replace("/", "-").replace(",", ".").replace(" UTC", "Z")
     return read_date_text(_ONE_DIGIT.sub(r"0\1", text))
 
@@ -57,6 +61,7 @@ def parse_number(cell: str) -> float | None:
     if is_missing(cell):
         return np.nan
     try:
+        # Python reads 1_5 as 15, which in a log is a name or a range.
         return None if "_" in cell else float(cell)
     except ValueError:
         return None

@@ -48,6 +48,8 @@ def find_time_name(names: Iterable[str], channels: Collection[str] = ()) -> str 
         Names that are known to be those of measured values.
     """
     given = list(names)
+    # By kind first, then by place: `t` anywhere in the header comes before `elapsed time` in the first column, and that
+    # before a column `day`.
     for kind in _NAMES:
         for name in given:
             if kind.fullmatch(name.strip().lower()) and name.strip() != TEMPERATURE:
@@ -58,6 +60,8 @@ def find_time_name(names: Iterable[str], channels: Collection[str] = ()) -> str 
 def _find_epoch_unit(time: float) -> str | None:
     """Return the unit in which a number is a time since 1970, None if it is too small for one."""
     low, high = EPOCH_SECONDS
+    # The four ranges do not overlap: 53 years are a factor of 2.8, units differ by 1000. So the size of a number tells
+    # its unit, if it counts from 1970 at all.
     return next((unit for unit in ("s", "ms", "us", "ns") if low <= time * SECONDS_OF_UNIT[unit] < high), None)
 
 
@@ -66,6 +70,8 @@ def _are_uptimes(times: FloatArray) -> bool:
     steps = np.diff(times)
     if len(steps) == 0 or _find_epoch_unit(float(times[0])) != "s":
         return False
+    # 1e9 may be the year 2001, or 1000 s in microseconds. Microseconds of a clock are whole and far apart; seconds of
+    # dates are so, too, but then in minutes, as a station logs them.
     step = float(np.median(steps))
     return bool(np.all(times == np.rint(times)) and step >= 1000 and step % 60 != 0)
 
@@ -100,6 +106,7 @@ def build_log(
         refuse_without_times(source, columns)
     if time not in columns:
         raise InputError(f"{source} has no column {shorten(time)}; its columns are {join_names(columns)}.")
+    # A unit of its own, as a second line of the header has it, is preferred to one in the name.
     stated = {name: units.get(name, "") or split_unit(name)[1] for name in columns}
     if columns[time].dtype.kind not in "biufMm":
         raise InputError(
@@ -134,6 +141,8 @@ def _convert_times(column: NDArray[Any], name: str, unit: str, keep_epoch: bool)
     """
     second = np.timedelta64(1, "s")
     if column.dtype.kind == "M":
+        # Relative to the first date: times as large as 1.7e9 s keep 2e-7 s as doubles, while differences of
+        # `datetime64` are exact.
         first = column[~np.isnat(column)][0]
         micros = first.astype("datetime64[us]").astype(np.int64)
         return (column - first) / second, "s", float(micros) / 1e6
@@ -145,11 +154,14 @@ def _convert_times(column: NDArray[Any], name: str, unit: str, keep_epoch: bool)
         words = re.split(r"[ _.\-/]", name.lower())
         unit = next((TIME_UNITS[word] for word in words if len(word) > 3 and word in TIME_UNITS), "")
     finite = numbers[np.isfinite(numbers)]
+    # A stated unit and the size of the numbers must agree for them to be dates: 1.7e9 stated as ms is 20 days of
+    # uptime.
     epoch = _find_epoch_unit(float(finite[0])) if len(finite) else None
     if epoch is None or (unit and unit != epoch) or (not unit and _are_uptimes(finite)):
         return numbers, unit, 0.0
     if keep_epoch:
         return numbers, epoch, 0.0
+    # Nanoseconds since 1970 have 19 digits, doubles 15: subtracted as integers, no sample moves.
     if column.dtype.kind in "iu":
         return (column.astype(np.int64) - int(column[0])).astype(np.float64), epoch, float(column[0])
     return numbers - finite[0], epoch, float(finite[0])

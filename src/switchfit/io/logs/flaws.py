@@ -31,11 +31,14 @@ _ANGLE = re.compile(r".*(yaw|heading|course|azimuth|theta|psi|angle|hdg|cog|bear
 def inspect_log(log: Log, repairs: Sequence[str]) -> Log:
     """Return the log with its issues, and repaired where asked for."""
     issues = list(log.issues)
+    # The order of `_FLAWS` matters: without times there is no order, and only in sorted times do equal ones stand side
+    # by side. Each search sees what the repairs before it have left.
     for name, find in _FLAWS.items():
         kind, flawed, kept, figures = find(log)
         if not flawed.any():
             continue
         first, repaired = int(flawed.argmax()), name in repairs
+        # A sample without a time has no place; all other flaws leave a log that can be looked at, and are reported.
         if name == "drop-missing-times" and not repaired:
             raise InputError(
                 f"{log.source}, column {log.time_name!r}: the time of sample {first + 1} is missing ({log.place} "
@@ -44,6 +47,7 @@ def inspect_log(log: Log, repairs: Sequence[str]) -> Log:
         figures |= {"count": flawed.sum(), "time": log.times[first]}
         issues.append(_make_issue(kind, log, first, None, repaired=repaired, **figures))
         log = _pick_samples(log, kept) if repaired else log
+    # After the repairs: a pause that only disorder has hidden is a gap now.
     issues += _find_gaps(log)
     wrapped = [repair.removeprefix("unwrap:") for repair in repairs if repair.startswith("unwrap:")]
     log = _handle_angles(log, [log.find_channel(name) for name in wrapped], issues)
@@ -59,6 +63,8 @@ def _find_missing(log: Log) -> tuple[str, NDArray[np.bool_], NDArray[Any], dict[
 def _find_falls(log: Log) -> tuple[str, NDArray[np.bool_], NDArray[Any], dict[str, float]]:
     steps = np.append(0.0, np.diff(log.times))[: len(log)]
     falls = steps < 0
+    # A logger of several sensors writes samples out of turn by a few intervals; a clock that is set, or a second
+    # recording in the same file, falls farther. Sorting repairs the first, and mixes the second.
     far = -steps[falls].min(initial=0.0) > REORDERED_WITHIN_STEPS * _find_typical_step(log.times)  # not so beside NaN
     kind = "log: clock jump" if far else "log: unsorted times"
     return kind, falls, np.argsort(log.times, kind="stable"), {"step": -steps[falls][:1].sum()}
@@ -76,6 +82,8 @@ _FLAWS = {"drop-missing-times": _find_missing, "sort": _find_falls, "drop-duplic
 def _find_gaps(log: Log) -> list[Issue]:
     steps, typical = np.diff(log.times), _find_typical_step(log.times)
     long = steps > GAP * typical
+    # Where a tenth of the intervals is long, the log was sampled in bursts or on events: then nothing is missing. Five
+    # intervals are too few to say what is typical.
     if not long.any() or long.sum() > max(1.0, MOST_GAPS * len(steps)) or len(steps) < 5:
         return []
     longest = int(np.argmax(steps))
@@ -92,6 +100,8 @@ def _handle_angles(log: Log, unwrapped: Sequence[str], issues: list[Issue]) -> L
         known = np.flatnonzero(np.isfinite(samples))
         steps = np.abs(np.diff(samples[known]))
         jumps = steps > turn / 2
+        # A jump of more than half a turn may be a wrap; it is one if most steps are small. A channel that jumps all the
+        # time, as noise or a counter does, is left alone.
         if jumps.any() and np.median(steps) < turn / 4:
             first = int(known[int(jumps.argmax()) + 1])
             figures = {"count": jumps.sum(), "turn": turn, "repaired": name in unwrapped}
@@ -109,6 +119,7 @@ def _find_turn(name: str, unit: str, samples: FloatArray, asked: bool) -> float 
         return None
     if unit in ("deg", "°", "degree", "degrees", "rad"):
         return 2 * np.pi if unit == "rad" else 360.0
+    # Without a unit the range decides: an angle that spans more than 2.2 pi cannot be one in rad, wrapped.
     if unit == "" and (asked or _ANGLE.fullmatch(name)):
         return 360.0 if np.ptp(known) > 2.2 * np.pi else 2 * np.pi
     if asked:

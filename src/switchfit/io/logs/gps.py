@@ -61,6 +61,7 @@ def read_gpx(path: Path, options: Options) -> Log:
     except Exception as error:  # of the parser of XML, of numbers, of dates
         raise InputError(f"{path} is no GPX file: {error}.") from error
     points = [point for track in gpx.tracks for segment in track.segments for point in segment.points]
+    # A planned route has points without times: there is nothing to fit it to.
     if not any(point.time for point in points):
         raise InputError(f"{path} has no track with times: of {len(points)} points, none has a time.")
     times = np.array([None if p.time is None else _count_micros(p.time) for p in points], dtype="datetime64[us]")
@@ -89,11 +90,14 @@ def read_nmea(path: Path, options: Options) -> Log:
     day: date | None = None
     for line, sentence in _parse_sentences(pynmea2, decode(path), damaged):
         clock = getattr(sentence, "timestamp", None)
+        # Sentences of one epoch have one time of day, and are one sample: GGA with the position, RMC with the date and
+        # the speed, GST with the errors. What an earlier sentence of the epoch says is kept.
         if sentence.sentence_type not in _CHANNELS or not hasattr(clock, "hour"):
             continue
         if not fixes or fixes[-1]["clock"] != clock:
             fixes.append({"clock": clock, "line": line, "day": None})
         if sentence.sentence_type == "RMC" and isinstance(sentence.datestamp, date):
+            # RMC alone has the date, and not every receiver sends it.
             day = fixes[-1]["day"] = sentence.datestamp
         fixes[-1] = _read_channels(sentence) | fixes[-1]
     if not any("latitude" in fix for fix in fixes):
@@ -101,6 +105,7 @@ def read_nmea(path: Path, options: Options) -> Log:
             f"{path} has no GGA, RMC or GNS sentence with a position and a time; there is nothing to read."
         )
     micros = _count_fixes(fixes)
+    # Without a date anywhere the times are seconds since the first midnight.
     times = micros.astype("datetime64[us]") if day else micros * 1e-6
     rows = np.array([fix["line"] for fix in fixes], dtype=np.intp)
     issues: tuple[Issue, ...] = ()
@@ -127,6 +132,7 @@ def _parse_sentences(pynmea2: ModuleType, text: str, damaged: list[int]) -> Iter
 def _read_channels(sentence: Sentence) -> dict[str, float]:
     """Return the channels that a sentence has; the position only if there is a fix."""
     numbers = {name: _read_float(getattr(sentence, own)) for name, own in _CHANNELS[sentence.sentence_type].items()}
+    # An empty field is a missing value. The altitude is that of the last fix where there is none now.
     found = {name: number for name, number in numbers.items() if number is not None}
     if "speed" in found:
         found["speed"] *= KNOT
@@ -141,6 +147,7 @@ def _has_fix(sentence: Sentence) -> bool:
     if sentence.sentence_type == "GGA":
         return bool(_read_float(sentence.gps_qual))
     if sentence.sentence_type == "GNS":
+        # One letter for each system of satellites; N is no fix, and one system is enough for a position.
         return any(mode not in "N" for mode in sentence.mode_indicator or "")
     return sentence.sentence_type == "RMC" and bool(sentence.status == "A")
 
@@ -155,7 +162,10 @@ def _read_float(given: str | float | None) -> float | None:
 def _count_fixes(fixes: list[dict[str, Any]]) -> NDArray[np.int64]:
     """Return microseconds of all fixes, since 1970 if a sentence states the date; days go on after midnight."""
     clocks = np.array([_count_micros(datetime.combine(EPOCH, fix["clock"].replace(tzinfo=UTC))) for fix in fixes])
+    # The time of day falls at midnight only, by almost a day: half a day tells this from sentences that come out of
+    # order.
     midnights = np.cumsum(np.append(0, np.diff(clocks) < -MICROSECONDS_PER_DAY // 2))
+    # The first date, counted back to the first sample, which may lie before it by some midnights.
     dated = ((fix["day"] - EPOCH).days - night for fix, night in zip(fixes, midnights, strict=True) if fix["day"])
     return (midnights + next(dated, 0)) * MICROSECONDS_PER_DAY + clocks
 

@@ -39,6 +39,7 @@ def find_delimiter(lines: Sequence[NumberedLine]) -> str:
 def split_lines(lines: Sequence[NumberedLine], delimiter: str) -> list[NumberedRow]:
     """Return the number and the cells of each line; of lines that quotes join, the number of the last one."""
     texts = [text.strip() if delimiter == " " else text for _, text in lines]
+    # Spaces behind a delimiter are dropped by the reader, those before it here: a loop over all cells, only if needed.
     reader = csv.reader(texts, delimiter=delimiter, skipinitialspace=True)
     try:
         rows = [(lines[reader.line_num - 1][0], cells) for cells in reader]
@@ -61,6 +62,7 @@ def read_header(rows: Sequence[list[str]], comment: list[str]) -> tuple[list[str
         Cells of the last line of comments before them: the names, if no row has any and the number is right.
     """
     begin = _skip_preamble(rows)
+    # Lines of names and units follow one another; the first line that begins with a number ends them.
     first = begin
     while first < len(rows) and _is_header(rows[first], first == begin):
         first += 1
@@ -71,6 +73,8 @@ def read_header(rows: Sequence[list[str]], comment: list[str]) -> tuple[list[str
 
 def _skip_preamble(rows: Sequence[list[str]]) -> int:
     """Return the index of the first row that has as many fields as most, if it is text; 0 otherwise."""
+    # Lines before the header, as loggers write them ("Device: ...", "Rate: 100 Hz"), have fewer fields than the data.
+    # The header is the first line as wide as the widest of the common ones; empty fields at the end do not count.
     common = Counter(map(len, rows)).most_common(1)[0][0]
     widths = [len(_strip_end(cells)) for cells in rows]
     width = max(own for own, cells in zip(widths, rows, strict=True) if len(cells) == common)
@@ -94,10 +98,12 @@ def _assign_lines(lines: list[list[str]]) -> tuple[list[str], list[str], dict[st
     """Tell names from units among the lines of a header."""
     width = max(map(len, lines))
     lines = [[*line, *[""] * (width - len(line))] for line in lines]
+    # A single line is always the names, though m and s may be names, too.
     unit_lines = [line for line in lines if _is_unit_line(line)] if len(lines) > 1 else []
     name_lines = [line for line in lines if line not in unit_lines] or unit_lines[:1]
     unique = [line for line in name_lines if len(set(line)) == width]
     if unique:
+        # Of a line of titles and one of short names, both unique, the short ones: they can be written in Python.
         chosen = max(unique, key=lambda line: sum(cell.isidentifier() for cell in line))
     elif len(name_lines) > 1:  # groups above names, each in a line
         chosen = [".".join(filter(None, cells)) for cells in zip(*name_lines, strict=True)]
@@ -110,6 +116,8 @@ def _assign_lines(lines: list[list[str]]) -> tuple[list[str], list[str], dict[st
         units = [strip_brackets(cell) or unit for cell, unit in zip(unit_lines[0], units, strict=True)]
     names = [name or f"column {k}" for k, name in enumerate(names, start=1)]
     places = {name: names.index(name) for name in names}
+    # Every other line names the columns as well, for `columns=`, unless the same word stands above several columns, as
+    # a group does.
     for line in [chosen, *name_lines]:
         once = {cell for cell, count in Counter(line).items() if cell and count == 1}
         places |= {cell: k for k, cell in enumerate(line) if cell in once and cell not in places}

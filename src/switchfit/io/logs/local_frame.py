@@ -66,6 +66,7 @@ def add_local_frame(log: Log, origin: tuple[float, float, float] | None, range_e
     if names is None:
         raise InputError(f"{log.source} has no latitude and longitude; its columns are {', '.join(log.channels)}.")
     latitude, longitude = log[names[0]], log[names[1]]
+    # Without an altitude the ellipsoid's surface is taken: east and north change by 1.6e-7 for each metre.
     altitude = log[names[2]] if len(names) == 3 else np.zeros(len(log))
     known = np.isfinite(latitude) & np.isfinite(longitude)
     if not known.any():
@@ -77,10 +78,12 @@ def add_local_frame(log: Log, origin: tuple[float, float, float] | None, range_e
         height = altitude[first] if np.isfinite(altitude[first]) else 0.0
         origin = (float(latitude[first]), float(longitude[first]), float(height))
     local = np.full((3, len(log)), np.nan)
+    # A fix in two dimensions has no height; for its east and north that of the origin is near enough.
     heights = np.where(np.isfinite(altitude[known]), altitude[known], origin[2])
     pymap3d = import_library("pymap3d", f"{log.source}: a position", "'switchfit[gps]'")
     local[:, known] = pymap3d.geodetic2enu(latitude[known], longitude[known], heights, *origin)
     local[2, ~np.isfinite(altitude)] = np.nan
+    # No channel `up` where the file has no altitude.
     added = LOCAL_CHANNELS[: len(names)]
     values = {**log.values, **dict(zip(added, local, strict=False))}
     log = replace(log, values=values, units={**log.units, **dict.fromkeys(added, "m")}, origin=origin)
@@ -100,6 +103,7 @@ def _add_sigma(log: Log, range_error: float) -> Log:
     values, units = dict(log.values), dict(log.units)
     for name in SIGMA_CHANNELS[:2]:
         known: FloatArray = values.get(name, np.full(len(log), np.nan))
+        # A receiver's own standard deviation (GST) is better than one from the geometry alone.
         values[name] = np.where(np.isfinite(known), known, hdop * range_error / np.sqrt(2))
         units[name] = "m"
     return replace(log, values=values, units=units)

@@ -167,6 +167,7 @@ class Log:
         if isinstance(name, str):
             return self.values[self.find_channel(name)]
         if isinstance(name, Sequence):
+            # A name in the header may be a label; the channels of the new log have their own names.
             names = [self.find_channel(entry) for entry in name]
             return replace(
                 self,
@@ -178,6 +179,7 @@ class Log:
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         """All channels as a (K, q) array."""
+        # NumPy calls this wherever a log is given in place of an array, as in Measurements(log.times, log[[...]]).
         columns = [np.asarray(values, dtype=dtype) for values in self.values.values()]
         return np.stack(columns, axis=1) if columns else np.zeros((len(self), 0))
 

@@ -79,6 +79,7 @@ def _load(path: Path) -> dict[str, MatValue]:
     with explain_read_errors(path), path.open("rb") as file:
         head = file.read(520)
     with explain_damage(path, "a .mat file"), warnings.catch_warnings():
+        # Version 7.3 is HDF5 behind a block of 512 bytes, which other writers leave out.
         if HDF5 in (head[:8], head[512:520]):
             h5py = import_library("h5py", f"{path}: a .mat file of version 7.3", "'switchfit[matlab]'")
             with h5py.File(path, "r") as file:
@@ -93,10 +94,12 @@ def _load(path: Path) -> dict[str, MatValue]:
 
 def _read_hdf(h5py: ModuleType, item: MatValue) -> MatValue:
     """Return a group as a dict, text as a string, and an array in MATLAB's order of dimensions."""
+    # A timeseries or a table: MATLAB stores numbers that only its own classes can look up.
     if "MATLAB_object_decode" in item.attrs:
         return None  # numbers that stand for an object
     if isinstance(item, h5py.Group):
         return {name: _read_hdf(h5py, entry) for name, entry in item.items()}
+    # MATLAB stores by columns, HDF5 by rows.
     value = np.asarray(item[()]).T
     if item.attrs.get("MATLAB_class") == b"char":
         return "".join(map(chr, value.ravel().tolist()))
@@ -108,6 +111,7 @@ def _flatten(group: Mapping[str, MatValue], prefix: str = "") -> Iterator[tuple[
     for name, value in group.items():
         if isinstance(value, Mapping):
             yield from _flatten(value, f"{prefix}{name}.")
+        # Simulink's signals are an array of structs: signals_1.values, signals_2.values, ...
         elif isinstance(value, list) and all(isinstance(entry, Mapping) for entry in value):
             yield from _flatten({f"{name}_{k}": entry for k, entry in enumerate(value, start=1)}, prefix)
         elif isinstance(value, (np.ndarray, str)):
@@ -121,6 +125,7 @@ def _find_times(arrays: Mapping[str, NDArray[Any] | str], time: str | None) -> d
         struct, _, own = name.rpartition(".")
         if _is_vector(value) and time in (None, own):
             vectors.setdefault(struct, []).append(own)
+    # A struct counts if a vector in it is called like a time, or as the user says.
     found = {struct: find_time_name(names) if time is None else time for struct, names in vectors.items()}
     return {struct: name for struct, name in found.items() if name is not None}
 
@@ -136,5 +141,6 @@ def _split_channels(name: str, value: NDArray[Any] | str, samples: int) -> dict[
         return {}
     if array.ndim == 1:
         return {name: array}
+    # A square matrix is ambiguous: a row for each time is taken, as MATLAB's solvers return it.
     rows = array if array.shape[0] == samples else array.T
     return {f"{name}_{k + 1}": rows[:, k] for k in range(rows.shape[1])}

@@ -22,6 +22,7 @@ def read_parquet(path: Path, options: Options) -> Log:
         If the file cannot be read.
     """
     parquet = import_library("pyarrow.parquet", f"{path}: Parquet", "'switchfit[parquet]'")
+    # To NumPy inside as well: a damaged page is noticed only when its values are decoded.
     with explain_damage(path, "a Parquet file"):
         table = parquet.read_table(path)
         columns = {name: table.column(name).to_numpy() for name in table.column_names}
@@ -31,6 +32,7 @@ def read_parquet(path: Path, options: Options) -> Log:
 
 def _find_units(schema: Any) -> dict[str, str]:
     """Return units from the metadata "unit" or "units" of each field, and from the attrs that pandas writes."""
+    # DataFrame.attrs are written by pandas since 2.1; what is in a field's own metadata is nearer, and wins.
     pandas = json.loads((schema.metadata or {}).get(b"pandas", b"{}"))
     attributes = pandas.get("attributes", {})
     units = dict(attributes.get("units", {})) if isinstance(attributes, dict) else {}

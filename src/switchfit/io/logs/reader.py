@@ -119,10 +119,14 @@ def read_source(path: Path, given: Options) -> Log:
     """
     options, origin = check_options(given), check_origin(given.origin)
     log = _read_format(path, options)
+    # East and north are computed before the channels are picked, of which latitude and longitude are none any more.
+    # Formats of positions always have them.
     wanted = any(name in FRAME_CHANNELS and name not in log for name in options.columns or ())
     if wanted or origin is not None or options.range_error is not None or log.has_positions:
         log = add_local_frame(log, origin, options.range_error)
     log = log if options.columns is None else log[list(options.columns)]
+    # After the channels are picked: what is odd about others does not concern anybody. Before the unit is changed:
+    # figures are those of the file.
     log = inspect_log(log, options.repair)
     return log if options.time_unit is None else convert_time_unit(log, options.time_unit)
 
@@ -130,12 +134,14 @@ def read_source(path: Path, given: Options) -> Log:
 def _read_format(path: Path, options: Options) -> Log:
     """Read a file of any format, which the end of its name tells, or how it begins."""
     ending = Path(path.name.lower().removesuffix(".gz")).suffix
+    # By its name; a `.log` or a `.txt` may be NMEA, which its first line tells.
     form = _BAG_FORMAT if os.path.isfile(path / "metadata.yaml") else _FORMATS.get(ending)
     module, reader, what, lacks = form or (_NMEA_FORMAT if _is_nmea(path) else _TEXT_FORMAT)
     for name in lacks:
         value = getattr(options, name)
         if value is not None:
             raise InputError(f"{path} is {what}, for which {name} means nothing; leave out {name} = {shorten(value)}.")
+    # Readers are imported here: ROS, MATLAB and GPS need libraries that most users have not.
     log: Log = getattr(importlib.import_module(f"switchfit.io.logs.{module}"), reader)(path, options)
     return log
 

@@ -38,11 +38,13 @@ def explain_damage(path: Path, what: str) -> Iterator[None]:
     what : str
         What it cannot be read as, with its article.
     """
+    # A missing file is said to be missing; libraries say so in many ways, some of them that it is damaged.
     with explain_read_errors(path):
         path.stat()
     try:
         yield
     except InputError:
         raise
+    # Any exception: on damaged bytes, readers raise KeyError, struct.error, RuntimeError and their own.
     except Exception as error:
         raise InputError(f"{path} cannot be read as {what}: {error or type(error).__name__}") from error

@@ -76,8 +76,10 @@ def read_bag(path: Path, options: Options) -> Log:
 
 
 def _read_topic(path: Path, reader: Connection, options: Options) -> Log:
+    # One topic may have several connections, one for each node that publishes it; their messages come in order of time.
     connections = _choose_connections(path, reader.connections, options.topic)
     kind, topic = connections[0].msgtype, connections[0].topic
+    # A type that is not known still has numbers: each gets a channel by its path in the message.
     read = _READERS.get(kind, _flatten)
     start = reader.start_time
 
@@ -91,6 +93,8 @@ def _read_topic(path: Path, reader: Connection, options: Options) -> Log:
     if not found:
         raise InputError(f"{path}: topic {topic} has no messages; there is nothing to read.")
     received, stamps, records, events = zip(*found, strict=True)
+    # Stamps say when something was measured, times of receipt when it was written: they differ by the delay of the
+    # network, which a fit would take for one of the robot. A header with all stamps 0 was never filled in.
     has_stamps = any(stamps)
     moments = np.array(stamps if has_stamps else received)
     zero = (
@@ -98,6 +102,7 @@ def _read_topic(path: Path, reader: Connection, options: Options) -> Log:
     )  # all topics of a bag count from its begin
     names = dict.fromkeys(name for record in records for name in record)
     values = {name: np.array([record.get(name, np.nan) for record in records], dtype=np.float64) for name in names}
+    # sigma_x has the unit of x, wheel.position that of position.
     quantities = {name: name.rpartition(".")[2].removeprefix("sigma_") for name in values}
     units = {name: _UNITS.get(quantity, "") for name, quantity in quantities.items() if kind in _READERS}
     issues = () if has_stamps else (Issue("log: no stamps", (str(path), topic)),)
@@ -136,9 +141,11 @@ def _read_stamp(message: Message) -> int:
 
 def _read_fix(message: Message) -> Record:
     position = ("latitude", "longitude", "altitude")
+    # Receivers go on sending without a fix, with the last position or zeros.
     if message.status.status < 0:  # no fix
         return dict.fromkeys(position, np.nan)
     found = {name: getattr(message, name) for name in position}
+    # The diagonal of a 3 by 3 matrix, east, north, up, in rows; type 0 says that it is unknown.
     variances = np.asarray(message.position_covariance)[[0, 4, 8]]
     if message.position_covariance_type > 0 and np.all(variances > 0):
         found |= dict(zip(SIGMA_CHANNELS, np.sqrt(variances).tolist(), strict=True))
@@ -149,6 +156,7 @@ def _read_motion(motion: Message) -> Record:
     """Return the channels of a pose or of a twist, and the square roots of variances that are given: 0 is unknown."""
     if hasattr(motion, "covariance"):
         names, inner = (_POSE, motion.pose) if hasattr(motion, "pose") else (_TWIST, motion.twist)
+        # The diagonal of 6 by 6. Of the angles only yaw has a channel; its place is the last one.
         variances = zip(names, np.asarray(motion.covariance)[::7].tolist(), strict=True)
         return _read_motion(inner) | {f"sigma_{name}": float(np.sqrt(v)) for name, v in variances if name and v > 0}
     if hasattr(motion, "position"):
@@ -179,6 +187,7 @@ def _find_yaw(q: Message) -> float:
     """Return the angle about the vertical axis of a quaternion; NaN for the zero quaternion, which is no rotation."""
     if q.x == q.y == q.z == q.w == 0.0:
         return np.nan
+    # Yaw of the rotation z-y'-x'', which needs no normalised quaternion: both arguments scale alike.
     return float(np.arctan2(2 * (q.w * q.z + q.x * q.y), q.w**2 + q.x**2 - q.y**2 - q.z**2))
 
 

@@ -44,6 +44,7 @@ def read_text(path: Path, options: Options) -> Log:
     time = _find_time(table, wanted or (), options) if options.time is None else _find_column(table, options.time)
     chosen = [k for k in range(len(names)) if k != time] if wanted is None else list(dict.fromkeys(wanted))
     if drop_broken:
+        # Before the times are read: a line whose time is broken must not stop them.
         table = _drop_text(table, time, chosen)
     log = _read_times(table, time, options)
     values: dict[str, FloatArray] = {}
@@ -54,6 +55,8 @@ def read_text(path: Path, options: Options) -> Log:
         issues.append(Issue("log: broken lines", (table.source, "line"), figures))
     for k in chosen:
         found, bad = table.parse_column(k)
+        # A column is numbers, or text whose changes are events, or it is left out and reported; one that the user has
+        # asked for by name must be numbers, or its first other cell is an error.
         if not bad.any() and names.count(names[k]) == 1:
             values[names[k]] = found
         elif wanted is not None:
@@ -116,6 +119,7 @@ def _read_times(table: TextTable, column: int, options: Options) -> Log:
     sample = next((cell for cell in cells if not is_missing(cell)), "") if is_text else ""
     lower = [own.lower() for own in table.names]
     day = next((lower.index(own) for own in _DATE_NAMES if own in lower), None)
+    # The first cell that is not missing decides for the column; one of another kind further down is an error.
     is_clock = CLOCK_TIME.fullmatch(sample) is not None
     if is_clock and day is None:
         what = "is not a time of day such as 12:34:56.789, as the others are."
@@ -133,6 +137,7 @@ def _read_times(table: TextTable, column: int, options: Options) -> Log:
         zones = {zone for _, zone in dates} - {None}
         zone = zones.pop() if len(zones) == 1 else "UTC"
     elif is_text and all(map(LONG_INTEGER.fullmatch, cells)):
+        # Nanoseconds since 1970 stay integers until the first of them is subtracted.
         times = np.array(list(map(int, cells)))
     else:
         times, bad = table.parse_column(column)
@@ -157,6 +162,7 @@ def _refuse_cell(table: TextTable, column: int, cells: Sequence[str], row: int, 
 
 def _drop_text(table: TextTable, time: int, channels: Sequence[int]) -> TextTable:
     """Return the table without the lines that have text in a column of numbers, or no time."""
+    # A column of text alone, such as the name of a mode, has no numbers to miss: its cells break no line.
     broken = np.zeros(len(table.lines), dtype=bool)
     for k in (time, *channels):
         cells, bad = table.columns[k], table.parse_column(k)[1]

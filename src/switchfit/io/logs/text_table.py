@@ -70,6 +70,7 @@ class TextTable:
                 return np.fromiter(map(float, cells), dtype=np.float64), np.zeros(len(cells), dtype=bool)
         except ValueError:
             pass
+        # Cell by cell, which is slower, only if one is no number.
         found = list(map(parse_number, cells))
         return np.array(found, dtype=np.float64), np.array([number is None for number in found])
 
@@ -82,7 +83,9 @@ def read_table(path: Path, drop_broken: bool) -> TextTable:
         kept = kept[1:]
     if not kept:
         raise InputError(f"{path} is empty; it needs a line with the names of the columns and one line per sample.")
+    # From the first lines, header included, as the whole file would take longer than reading it.
     delimiter = find_delimiter(kept[:SNIFFED])
+    # The last comment before the header may have the names: `# t, x, y`, as NumPy writes them.
     comments = [
         (k, line.strip().lstrip("#% \t")) for k, line in lines[: kept[0][0] - 1] if line.lstrip().startswith(COMMENTS)
     ]
@@ -90,6 +93,9 @@ def read_table(path: Path, drop_broken: bool) -> TextTable:
         head, notes = split_lines(kept[:SNIFFED], delimiter), split_lines(comments[-1:], delimiter)
         names, units, places, first = read_header([cells for _, cells in head], notes[0][1] if notes else [])
         width, body = len(names), kept[first:]
+        # Two ways to the same table. A file of numbers alone is read as a block. Any other one, with text, missing
+        # cells in words, commas as decimals or broken lines, is split into cells, which keep what a message has to
+        # show.
         numbers = None if drop_broken else _parse_block([line for _, line in body], delimiter, width)
         if numbers is not None:
             return TextTable(str(path), names, units, places, np.array([k for k, _ in body]), list(numbers.T.copy()))
@@ -108,6 +114,8 @@ def _parse_block(lines: list[str], delimiter: str, width: int) -> FloatArray | N
 
     NumPy's reader takes a quarter of the time that cells take.
     """
+    # Empty fields become nan in the text itself. The lines around it, which are empty, make the first and the last
+    # field of every line stand between two marks.
     text = "\n".join(["", *lines, ""])
     if delimiter != "," and "." not in text:
         text = text.replace(",", ".")
@@ -115,6 +123,7 @@ def _parse_block(lines: list[str], delimiter: str, width: int) -> FloatArray | N
         for empty in (2 * delimiter, 2 * delimiter, f"\n{delimiter}", f"{delimiter}\n"):  # pairs may overlap
             text = text.replace(empty, f"{empty[0]}nan{empty[1]}")
     lines = text.split("\n")[1:-1]
+    # Doubles would round them: cells keep them as text, from which integers are read.
     if not lines or LONG_INTEGER.search(lines[0]):
         return None
     try:
@@ -132,6 +141,7 @@ def _check_widths(rows: list[NumberedRow], width: int, drop: bool) -> tuple[list
     kept: list[NumberedRow] = []
     broken: list[int] = []
     for line, cells in rows:
+        # Spreadsheets end lines with delimiters of columns that were cleared.
         while len(cells) > width and not cells[-1]:
             cells.pop()
         if len(cells) == width:

@@ -28,6 +28,7 @@ def align_starts(logs: Sequence[Log]) -> list[Log]:
     ----------
     logs : sequence of Log
     """
+    # Logs of one run each begin at 0 when they are read; their offsets say how far apart these zeros are.
     starts = [log.offset * SECONDS_OF_UNIT[log.time_unit] for log in logs if log.offset]
     return [_shift_start(log, min(starts)) if log.offset else log for log in logs]
 

@@ -17,12 +17,14 @@ _PLAIN = (
     "kph", "psi", "rev", "bit", "bool", "fps", "sec", "msec", "usec", "nsec", "mol", "lx", "dB", "mps", "kmh",
 )  # fmt: skip
 
+# Longest first: of the alternatives of a regular expression the first that matches is taken, and m is not min.
 _FACTOR = re.compile(
     rf"(?:{'|'.join(re.escape(u) for u in sorted(_PLAIN, key=len, reverse=True))}"
     rf"|[nuµμmckMG]?(?:{'|'.join(re.escape(u) for u in sorted(_PREFIXED, key=len, reverse=True))}))"
     r"(?:\^?-?\d|\*\*-?\d|[²³⁻¹]+)?"
 )
 
+# Few, and after a letter that is no underscore: `x_m` is in metres, but `a_s` or `index_d` may be anything.
 _SUFFIX = re.compile(r"[^_]_(ns|us|ms|s|sec|min|rad|deg|m|mm|cm|km|Hz|rpm|mps|Nm)$")
 
 
@@ -47,6 +49,7 @@ def split_unit(name: str) -> tuple[str, str]:
     A suffix stays in the name; the unit is empty where there is none.
     """
     match = re.fullmatch(r"(.*\S)\s*(\[[^\[\]]{1,12}\]|\([^()]{1,12}\))", name)
+    # Square brackets hold units whatever they say; round ones also remarks, as in `speed (left)`.
     if match and (is_unit(match[2]) or match[2][0] == "["):
         return match[1], strip_brackets(match[2])
     suffix = _SUFFIX.search(name)

@@ -75,7 +75,10 @@ def build_problem(
     runs = build_experiments(path, contents, opened, searched=searched)
     problem = _build_problem(path, contents, runs, searched)
     library = {} if contents.library is None else contents.library.model_dump(exclude_none=True, by_alias=True)
+    # Built and dropped: a library that is wrong is an error of the file, also where a fit does not need it. The number
+    # of switches is the command's, and any will do for the check.
     build_at(f"{path}: library", build_library, problem, **library, max_switches=1)
+    # [options] has two readers: what `Problem` takes is left out here, and taken below.
     options = contents.options.model_dump(include=OPTIONS, exclude_none=True)
     folder = path.absolute().parent
     provenance = Provenance(
@@ -86,6 +89,7 @@ def build_problem(
         options=options,
         files=tuple(digest_file(folder, file) for file in list_files(folder, contents)),
     )
+    # A pattern was replaced by the logs that it stands for: the mode search writes its result as a file of these.
     used = contents.model_copy(update={"experiments": list(runs.tables)})
     return ProblemFile(path, problem, options, provenance, runs.issues, library, used)
 

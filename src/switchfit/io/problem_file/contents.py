@@ -41,6 +41,7 @@ def read_contents(path: Path, text: str | None = None) -> tuple[str, Contents]:
         contents = Contents.model_validate(given)
     except pydantic.ValidationError as error:
         raise InputError(f"{path}: {_describe_error(error)}") from error
+    # Which tables a file needs depends on others, which pydantic's fields cannot say.
     if contents.problem is not None:
         others = [key for key in ("model", "parameters", "experiments") if key in given]
         if others:
@@ -56,6 +57,7 @@ def read_contents(path: Path, text: str | None = None) -> tuple[str, Contents]:
 
 def _describe_error(error: pydantic.ValidationError) -> str:
     """Return the first error in a file as a sentence."""
+    # A misspelt key first: of two errors, it explains why another key is missing.
     errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
     table, field, key = _follow_location(first["loc"])
@@ -69,6 +71,7 @@ def _describe_error(error: pydantic.ValidationError) -> str:
         sentence = f"{key} {_rephrase(first['msg'])}; got {reprlib.repr(first['input'])} ({description})."
         if first["type"] == "missing":
             sentence = f"the key {key} is missing: {description}."
+    # One place once: of a union, pydantic reports an error for each of its members.
     different = {_follow_location(each["loc"])[2] for each in errors} - {key}
     return sentence + (f" Also wrong: {', '.join(sorted(different))}." if different else "")
 
@@ -83,11 +86,13 @@ def _follow_location(location: Sequence[str | int]) -> tuple[type[TomlTable], st
     key = place = ""
     is_chosen = False  # by the user, as the names of parameters are
     for step in location:
+        # Counted from 1, as one counts the tables in the file.
         if isinstance(step, int):
             place += f"[{step + 1}]"
         elif is_chosen:
             place += f".{step}"
             is_chosen = False
+        # Steps that are neither keys nor numbers are the tags of unions and the names of validators.
         elif inner is not None and (step in inner.model_fields or step == location[-1]):
             place += f".{step}" if place else step
             holder, key = inner, step

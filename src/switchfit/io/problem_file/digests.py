@@ -20,16 +20,19 @@ def list_files(folder: Path, contents: Contents) -> list[Path]:
         names.append(name)
         return name
 
+    # The walk over all names of files, for its side effect: what it returns is not needed.
     replace_files(contents.model_dump(exclude_none=True), note)
     files: list[Path] = []
     for name in names:
         if name.endswith(".py"):
+            # Modules beside the file alone: with the path of the interpreter it would list all of JAX.
             finder = ModuleFinder([str((folder / name).parent)])
             finder.run_script(str(folder / name))
             found = (getattr(module, "__file__", None) for module in finder.modules.values())
             files += [Path(file) for file in found if file is not None]
         else:
             for path in (folder / log for log in find_logs(folder, name) or [name]):
+                # The folder of a bag of ROS 2 is one log, of several files.
                 files += sorted(path.rglob("*")) if path.is_dir() else [path]
     return list(dict.fromkeys(files))
 

@@ -103,6 +103,8 @@ def build_experiments(
     issues: dict[str, Issue] = {}
     for k, runs in enumerate(opened, start=1):
         where = f"{path}: experiments[{k}]"
+        # Of many logs, one that cannot be used does not stop the others; if none can be used, the first error is
+        # raised.
         refused: list[ValueError] = []
         for table, logs in runs:
             try:
@@ -111,6 +113,7 @@ def build_experiments(
                     table = build_at(where, _add_first_sequence, path, table, contents.library, found)
                 if isinstance(logs, ValueError):
                     raise logs
+                # By their sentences: a log that several experiments name is odd once.
                 issues |= {str(issue): issue for log in logs for issue in log.issues}
                 experiments.append(build_at(where, _Run(path.parent, where, contents, table, system).build, logs))
                 used.append(table)
@@ -137,6 +140,7 @@ def _add_first_sequence(
         )
     if table.transition_times is not None:
         raise ValueError("transition_times belong to a mode_sequence, which is missing: leave out both, or none.")
+    # Any mode will do for the search to begin with, but one that may be first needs no repair.
     names = [*(library.first or ()), *(library.modes or ()), *system.modes]
     first = next(name for name in names if name in system.modes)
     return table.model_copy(update={"mode_sequence": [first], "transition_times": []})
@@ -144,10 +148,13 @@ def _add_first_sequence(
 
 def _check_units(item: DataTable, units: Sequence[str], system: HybridSystem) -> None:
     """Refuse a column in the unit of the state that it measures, but for its prefix: nothing converts it."""
+    # The Greek mu, the micro sign and the u of files are one prefix.
     states, simple = system.state_names or (), str.maketrans("uμ", "µµ")
     known = dict(zip(states, system.state_units or (), strict=False))
     for column, state, unit in zip(item.columns, item.observe or states, units, strict=False):
         pair = [found.translate(simple) for found in (unit, known.get(state, ""))]
+        # Each unit as it is and without its first letter, if that is a prefix: m and mm share m. A unit that is
+        # altogether another one is left to the user, who may know that they are the same.
         bare, other = ({name, name[name[:1] in PREFIXES :]} - {""} for name in pair)
         if pair[0] != pair[1] and bare & other:
             raise ValueError(
@@ -178,6 +185,7 @@ class _Run:
                 data.append(build_at(where, self._build_data, place, item, log))
         times, state = table.transition_times, table.initial_state
         jumps = {f"jumps[{k}]": jump for k, jump in enumerate(table.jumps, start=1)}
+        # Keys that `Experiment` takes as they are; all others are built first.
         given: dict[str, Any] = table.model_dump(
             include={"t0", "parameter_map", "name", "time_unit", "origin", "time_zone"}
         )
@@ -196,6 +204,7 @@ class _Run:
         """Return a function of a Python file, or one in its place if that is not to be run."""
         if self.system is not None:
             return load_object(reference, self.folder, f"{self.where}.{place}")
+        # Without running it (`switchfit check --no-run`), it can be said that the file is there.
         find_object(reference, self.folder, f"{self.where}.{place}")
         return lambda t, x, p: x
 
@@ -221,11 +230,14 @@ class _Run:
             raise ValueError("observe names states, but the model has no state_names; add them to it.")
         if unknown := [name for name in table.observe if name not in states]:
             raise ValueError(f"observe names the unknown state {unknown[0]!r}; the states are {', '.join(states)}.")
+        # By their places: names of states mean nothing inside a traced function.
         picked = np.array([states.index(name) for name in table.observe])
         return lambda t, x, p: x[picked]
 
     def _build_data(self, place: str, item: DataTable, log: Log) -> Measurements | ReferenceSignal:
         observe = self._build_observe(place, item)
+        # What the user has set, not what a field has by default: loss = "linear" is an error for a reference, too, if
+        # it stands in the file.
         if foreign := item.model_fields_set & {
             key for kind in KEYS_OF_ONE_KIND if kind != item.kind for key in KEYS_OF_ONE_KIND[kind]
         }:
@@ -242,6 +254,7 @@ class _Run:
         more: dict[str, Any] = {"observe": observe, "names": names, "units": units[:q]}
         if kind is ReferenceSignal:
             return ReferenceSignal.from_samples(times, values, lowpass_hz=item.lowpass_hz, weights=item.weights, **more)
+        # Columns that hold sigma stand behind the values in what was cut from the log.
         sigma = values[:, q:] if values.shape[1] > q else item.sigma
         given = item.model_dump(include={"loss", "loss_scale", "delay"})
         return Measurements(times, values[:, :q], sigma=sigma, **given, **more)
@@ -253,6 +266,7 @@ class _Run:
             given, values = [self.table.t0 or 0.0], np.zeros((1, len(units)))
         if isinstance(item.columns, dict):
             named = dict(zip(item.columns, values.T, strict=True))
+            # `Input` sorts named entries by name, as JAX does with dicts; units have the same order.
             ordered = tuple(unit for _, unit in sorted(zip(item.columns, units, strict=True)))
             return Input(given, named, kind=item.kind, units=ordered)
         return Input(given, values[:, 0] if len(item.columns) == 1 else values, kind=item.kind, units=units)

@@ -80,6 +80,7 @@ def load_problem(
     path = Path(path)
     text, contents = read_contents(path, text)
     contents, opened = _open(path, contents, log, streamed=streamed)
+    # The third step, with JAX.
     from switchfit.io.problem_file.building import build_problem
 
     return build_problem(path, text, contents, opened, log, searched=searched)
@@ -115,6 +116,7 @@ def _open(
     path: Path, contents: Contents, log: str | Path | None, *, streamed: bool = False
 ) -> tuple[Contents, list[Opened]]:
     """Return the tables of a file, with another log in them if one is given, and its open logs."""
+    # Files that are missing are named before any log is read.
     for key, table in (("problem", contents.problem), ("model", contents.model)):
         if table is not None and (key == "problem" or ".py" in table.name):
             find_object(table.name, path.parent, f"{path}: {key}")
@@ -136,6 +138,8 @@ def _expand_patterns(folder: Path, table: ExperimentTable) -> list[ExperimentTab
     for single in (folder / pattern for pattern, logs in found.items() if logs is None):
         with explain_read_errors(single):
             single.stat()
+    # Data and inputs may have patterns of their own, `gps/*.csv` and `wheels/*.csv`: logs of one name are one run, and
+    # one without its counterpart is an error, not a run with less data.
     named = {pattern: dict(zip(name_files(logs), logs, strict=True)) for pattern, logs in found.items() if logs}
     if not named:
         return [table]
@@ -169,5 +173,6 @@ def _replace_log(path: Path, contents: Contents, log: str) -> Contents:
         )
     (table,) = contents.experiments
     left_out = any(item.file is None for item in table.list_logs().values())
+    # A file that is left out is the place for a log; else the first data, since a run has always some.
     files = {None if left_out else table.data[0].file: log}
     return contents.model_copy(update={"experiments": [_replace_files(table, files, table.name)]})

@@ -37,6 +37,7 @@ def open_experiments(
     opened = []
     for k, tables in enumerate(expanded, start=1):
         runs: Opened = []
+        # The error of a log is kept in its place: what the others are built of is not known yet.
         for table in tables:
             where = f"{path}: experiments[{k}]"
             try:
@@ -44,6 +45,7 @@ def open_experiments(
                     build_at(f"{where}.{place}", _open_log, path.parent, item, contents, table, streamed)
                     for place, item in table.list_logs().items()
                 ]
+                # GPS and wheels of one run began at different moments; only here are they known to belong together.
                 runs.append((table, align_starts(logs)))
             except ValueError as error:
                 runs.append((table, error))
@@ -57,11 +59,14 @@ def open_experiments(
 def _open_log(
     folder: Path, table: DataTable | InputTable, contents: Contents, run: ExperimentTable, streamed: bool
 ) -> Log:
+    # A column may be both a value and, by its name, sigma of another one.
     columns = list(dict.fromkeys(list_value_columns(table, contents, run)))
     if table.file is None and streamed:
         return Log(np.zeros(0), dict.fromkeys(columns, np.zeros(0)), dict.fromkeys(columns, ""), "", "the stream")
     if table.file is None:
         raise ValueError("the key 'file' is missing: name the log, or give logs: switchfit fit LOG ... --problem FILE.")
+    # `keep_epoch`: numbers since 1970 become dates only if the file says so by `epoch`, since a window or a guess in
+    # the file may count them as they are.
     given = table.model_dump(include={"time", "topic", "origin", "range_error", "repair"})
     log = read_source(folder / table.file, Options(columns=columns, keep_epoch=True, **given))
     return log if table.epoch is None else _count_from_1970(log, table.epoch)

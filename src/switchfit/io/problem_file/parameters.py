@@ -19,6 +19,7 @@ def build_parameter(table: tables.ParameterTable) -> Parameter:
     ----------
     table : ParameterTable
     """
+    # Without what is left out, so that the defaults are those of `Parameter`.
     given = table.model_dump(exclude_none=True)
     if (prior := given.pop("prior", None)) is not None:
         kinds: dict[tuple[str, ...], Any] = {("mean", "sd"): Normal, ("median", "log_sd"): LogNormal}

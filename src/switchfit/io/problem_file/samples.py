@@ -45,11 +45,14 @@ def cut_log(
                 f"{table.window[1]}]; they reach from {least} to {most}."
             )
     times = times[inside]
+    # Inside the window alone: disorder outside does not matter. With the log's own lines, which `Measurements` does not
+    # know.
     _check_order(log, times, log.rows[inside], what)
     values = np.stack([log[name][inside] for name in columns], axis=1)
     units = tuple(log.units[log.find_channel(name)] for name in columns)
     if log.dates is not None and _keep_dates(table, log, run):
         return log.dates[inside], values, units
+    # The first row that is used, not the first of the log.
     offset = times[0] if table.time_offset == "first" else table.time_offset
     return (times - offset) * _find_time_scale(log, table, run.time_unit), values, units
 
@@ -63,6 +66,7 @@ def _place_window(log: Log, table: LogTable, run: ExperimentTable) -> tuple[list
     if not all(dated) or log.dates is None:
         other = "numbers" if log.dates is None else "dates, of which the window has one"
         raise ValueError(f"window = [{ends[0]}, {ends[1]}] has dates, and {log.source} has {other}. Give both alike.")
+    # Window and log may be in different zones, or the log in none: compared as instants.
     zone = run.time_zone or log.time_zone
     dates = log.dates.localize(zone, log.source)
     origin = make_origin(dates.instants[0], zone)
@@ -88,6 +92,7 @@ def _find_time_scale(log: Log, table: LogTable, time_unit: str) -> float:
     unit = normalize_time_unit(time_unit)
     if table.time_scale is not None or log.time_unit in ("", unit) or unit not in SECONDS_OF_UNIT:
         return 1.0 if table.time_scale is None else table.time_scale
+    # Nothing is converted silently: guesses, bounds and min_duration in the file are in the unit of the experiment.
     scale = SECONDS_OF_UNIT[log.time_unit] / SECONDS_OF_UNIT[unit]
     raise InputError(
         f"{log.source}: the times are in {log.time_unit}, but time_unit of the experiment is {time_unit!r}. Set "

@@ -59,8 +59,10 @@ def describe_keys(kind: type[TomlTable]) -> dict[str, str]:
     kind : type
     """
     found: dict[str, str] = {}
+    # Base classes first, so that a table's own text of a key replaces the inherited one.
     for each in reversed(kind.__mro__[: kind.__mro__.index(TomlTable)]):
         (definition,) = ast.parse(inspect.getsource(each)).body
+        # A string expression right behind an annotated name is that key's text.
         for key, text in pairwise(ast.iter_child_nodes(definition)):
             if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr):
                 found[ast.unparse(key.target)] = " ".join(ast.literal_eval(text.value).split())
@@ -84,6 +86,7 @@ def is_date(given: object) -> bool:
 
 def _check_time(given: object) -> object:
     """Return a number or a date."""
+    # A bool is an int of Python, but true is no time.
     if isinstance(given, (int, float)) and not isinstance(given, bool):
         return float(given)
     if is_date(given):

@@ -63,7 +63,9 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
         Of the same run, by the names of their sources.
     run : Timed
     """
+    # A source by its name is how the page's script finds it: it puts numbers in, and moves them with the sliders.
     sources = {name: _make_source(name, own) for name, own in columns.items()}
+    # One range for all panels of a run, so that they zoom together.
     times = models.Range1d(name="times")
     blocks: list[Any] = []
     for c, own in enumerate(curves):
@@ -77,6 +79,7 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
                 below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual", sources, run)
                 below.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
                 _draw_residuals(below, own, k, samples)
+                # The labels of times are below the residuals.
                 panel.xaxis.visible = False
                 parts.append(below)
             parts[-1].xaxis.axis_label.text = label_time(run)
@@ -116,6 +119,7 @@ def _make_time_figure(
     plot.xgrid.visible = False
     plot.yaxis.ticker.desired_num_ticks = 5 if height > RESIDUAL_HEIGHT else 3
     clock = describe_clock(run)
+    # Ticks at dates are found in the browser, by functions of the page's script: their text depends on the zoom.
     if clock is not None:
         find = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
         label = "return switchfitDates.label(tick, ticks, start, length, zone)"
@@ -159,6 +163,7 @@ def _draw_curve(plot: Plot, curves: Curves, k: int, source: models.ColumnDataSou
     if "lo0" in curves.curve:
         band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
         plot.varea(x="fit_t", source=source, fill_color=PAGE_FIT_COLOUR, fill_alpha=0.25, **band)
+    # Hidden until a slider moves: then the fit stays visible behind the curve that moves.
     still = {"name": "still", "visible": False, "tags": ["muted"]}
     plot.line("fit_t", f"fit_y{k}", source=source, line_width=1.2, **DASHED_LOOK, **still)
     return plot.line("t", f"y{k}", source=source, line_color=PAGE_FIT_COLOUR, line_width=2, legend_label="fitted")

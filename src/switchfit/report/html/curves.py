@@ -121,6 +121,7 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     if len(segments) != len(trajectory.pieces):  # a mode without duration: other meshes have other nodes there
         times, nodes, segments = trajectory.times, None, trajectory.pieces
     values, slopes, band = _stack_outputs_and_states(estimate, e, nodes)
+    # Indices of nodes, -1 for a break. All columns of a curve are thinned alike, since the script moves them together.
     kept = _thin(segments, points)
     modes = np.repeat(trajectory.modes[trajectory.pieces[:-1]], np.diff(segments))
 
@@ -145,9 +146,11 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
         columns = range(first, first := first + len(names))
         late = find_delay(comparison, trajectory)
         count = len(comparison.times)
+        # Every k-th sample, rounded up, so that there are never more than the most.
         drawn = np.arange(0, count, max(-(-count // MOST_DRAWN_SAMPLES), 1))
         curve = list_curve(columns, late)
         if find_plane(names, units) is not None:
+            # A mark where a curve goes on after a break: at the transition.
             curve["size"] = np.where(np.roll(kept < 0, 1), 13.0, 0.0).astype("f4")
         # Samples are nodes, unless they are late. At a transition the derivative is that just before it.
         nearest = np.minimum(np.searchsorted(times, comparison.times[drawn] - late), len(times) - 1)
@@ -155,6 +158,7 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
         left_out = count - len(drawn) if comparison.kind == "measurements" else 0
         found.append(Curves(names, tuple(units), comparison.kind, curve, samples, left_out))
     measured = {name for comparison in estimate.comparisons[e] for name in comparison.names}
+    # States that no channel shows by name; the script has them, too, so that they move with the sliders.
     if hidden := [k for k, name in enumerate(trajectory.state_names) if name not in measured]:
         names, given = (tuple(own[k] for k in hidden) for own in (trajectory.state_names, trajectory.state_units))
         curve = list_curve([first + k for k in hidden], 0.0)
@@ -198,6 +202,7 @@ def _stack_outputs_and_states(
 
 def _thin(segments: NDArray[np.intp], points: int) -> NDArray[np.intp]:
     """Return which nodes are kept, the ends of all segments among them, with -1 where a transition breaks a curve."""
+    # The ends of segments are always kept: a curve that is cut short there would not meet its transition.
     stride = max(-(-int(segments[-1]) // points), 1)
     ends = itertools.pairwise(segments.tolist())
     parts = [np.unique(np.append(np.arange(start, end, stride), end - 1)) for start, end in ends]

@@ -31,6 +31,7 @@ def show_result(result: object) -> str:
     result : object
     """
     is_forecast = isinstance(result, Prediction)
+    # Panels that the figure would have.
     size = len(getattr(result, "output_names" if is_forecast else "trajectories", ()))
     is_empty = (is_forecast and not size) or (isinstance(result, Fits) and not len(result))
     image = ""

@@ -73,6 +73,7 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
+    # NaN is no JSON, and a browser would refuse all of it: what is not finite was replaced before.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     functions = (
         certify, find_issues, format_span, join_words, list_course, list_experiments, list_quality, list_reasons,
@@ -80,9 +81,11 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
         tabulate_correlations, tabulate_diagnostics, tabulate_fixed, tabulate_unknowns, unit_suffix, write_direction,
         write_reason, write_step,
     )  # fmt: skip
+    # Templates call these by their names. StrictUndefined makes a misspelt one an error, not a gap in the page.
     environment.globals |= {function.__name__: function for function in functions}
     runs, payload = _prepare_figures(estimate)
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
+    # Unknowns that are held have no correlation.
     known = np.flatnonzero(np.isfinite(np.diag(estimate.correlation)))[:MOST_CORRELATED]
     content = {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs}
     cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
@@ -121,6 +124,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
         written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
         ranges = {"times": {"start": first - margin, "end": last + margin}}
         figures.append({"template": template, "sources": written, "ranges": ranges})
+    # Unknowns with derivatives in some curve, in the order of the runs; without a cost there is nothing to compare.
     movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
     sliders = build_sliders(estimate, curves, list(movable) if np.isfinite(estimate.cost) else [])
     templates |= {"slice": json_item(draw_slice())} if sliders else {}

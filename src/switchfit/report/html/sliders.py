@@ -46,6 +46,7 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
         (low, high), theta = find_range(estimate, runs, place), float(estimate.theta[place])
         if not low < high:
             continue
+        # The estimate is a point of both sides, so that the rise is exactly 0 there.
         sides = np.linspace(low, theta, SIDE_POINTS + 1), np.linspace(theta, high, SIDE_POINTS + 1)
         values = np.unique(np.concatenate(sides))
         costs = np.array([evaluate_moved(estimate, place, value) for value in values])
@@ -78,9 +79,12 @@ def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) ->
             slope = float(np.nanmax(np.abs(own.curve[f"d{place}_{k}"]), initial=0.0))
             if len(known) and np.ptp(known) > 0 and slope > 0:
                 wanted.append(VISIBLE * float(np.ptp(known)) / slope)
+    # The first curve that moves visibly decides; an unknown that moves none gets a tenth of its value.
     half = min(wanted, default=0.0) or 0.1 * abs(theta) or 1.0
     constraints = estimate.evaluator_at_solution().problem.constraints
     slopes, slack = constraints.A[:, place], constraints.A @ estimate.theta - constraints.b
+    # Constraints A theta >= b, such as the order of transition times: how far this unknown can go with the others held.
+    # Not to the very end, where a mode has no duration, and J a kink.
     room = 0.98 * np.divide(slack, np.abs(slopes), out=np.full_like(slack, np.inf), where=slopes != 0)
     low = max(theta - np.min(room[slopes > 0], initial=half), float(estimate.lower[place]))
     high = min(theta + np.min(room[slopes < 0], initial=half), float(estimate.upper[place]))
@@ -106,5 +110,6 @@ def evaluate_moved(estimate: Estimate, place: int, value: float) -> float:
         costs = [evaluator.engines[e].cost(*problem.vectors(theta, e)) for e in runs]
         return sum(costs) + float(problem.unknowns.priors.evaluate(theta)[0])
 
+    # The difference of the runs that depend on it, added to J of all: the others are not evaluated.
     total = estimate.cost + add_up(moved) - add_up(estimate.theta)
     return float(total) if np.isfinite(total) else np.nan
