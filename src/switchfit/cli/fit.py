@@ -23,8 +23,8 @@ from switchfit.runtime.presentation import format_count, format_page, format_tex
 
 if TYPE_CHECKING:
     from switchfit.estimation.estimates import Estimate
-    from switchfit.estimation.provenance import Provenance
     from switchfit.io.problem_file.building import ProblemFile
+    from switchfit.io.provenance import Provenance
     from switchfit.optimize.result import IterationRecord
 
 Problems = Annotated[

@@ -15,8 +15,6 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation.messages import join_names
 from switchfit.runtime.errors import InputError
 
-# --- saved estimates, whose problem is built again from what they were made from --------------------------------------
-
 
 def _rebuild_problem(
     path: Path, given: Provenance | None, folder: Path | None = None, log: Path | None = None

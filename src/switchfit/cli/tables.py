@@ -14,8 +14,6 @@ from switchfit.report.selection import SCREEN
 from switchfit.runtime.frames import describe_frame
 from switchfit.uncertainty.quality import measure_quality
 
-# --- tables -----------------------------------------------------------------------------------------------------------
-
 
 def list_unknowns(estimate: Estimate) -> list[dict[str, Any]]:
     """Return a row for each unknown, with the columns of `Estimate.to_pandas`.

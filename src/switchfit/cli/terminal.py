@@ -11,9 +11,6 @@ from collections.abc import Sequence
 
 import typer
 
-# --- output -----------------------------------------------------------------------------------------------------------
-
-
 asked_options: set[str] = set()
 """Of --json, --quiet, --verbose and --debug those that the command which runs was given."""
 

@@ -14,8 +14,6 @@ from switchfit.uncertainty.identification import Direction, Identifiability
 RISE_ROUNDING = 1e-12
 """Rise of J, relative to J, that is rounding."""
 
-# --- identifiability --------------------------------------------------------------------------------------------------
-
 _PLACES = {"solution": "At the solution", "first guess": "At the first guess"}
 
 _RISES = {

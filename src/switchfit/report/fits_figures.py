@@ -31,9 +31,6 @@ FARTHEST = 30.0
 logarithmic scale that is not determined has an end of 1e166."""
 
 
-# --- figures ----------------------------------------------------------------------------------------------------------
-
-
 @draw_figure.register(Fits)
 def plot_fits(fits: Fits) -> Figure:
     """Draw a panel for each unknown: its histogram, or a row for each fit of a log.

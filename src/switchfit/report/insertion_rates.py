@@ -16,9 +16,6 @@ LISTED_RATE_MINIMA = 3
 """Minima of each mode in a table of insertion rates, and in its figure."""
 
 
-# --- insertion rates --------------------------------------------------------------------------------------------------
-
-
 @format_text.register(Insertion)
 def write_insertion(found: Insertion) -> str:
     """Return which pulse lowers J fastest, and the lowest minima of all modes.

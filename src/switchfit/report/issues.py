@@ -11,9 +11,6 @@ from switchfit.runtime.presentation import format_text
 _BOUND = "{names} is at its {kind} {value:g}: it has no standard error, and those of the others take it as known."
 
 
-# --- issues -----------------------------------------------------------------------------------------------------------
-
-
 @format_text.register(Issue)
 def write_issue(issue: Issue) -> str:
     """Return an issue as a sentence or two."""

@@ -16,9 +16,6 @@ EQUAL_BIC_DIFFERENCE = 0.05
 """Difference in BIC below which models are as good as each other: it would be printed as 0.0."""
 
 
-# --- comparison of models ---------------------------------------------------------------------------------------------
-
-
 @format_text.register(ModelComparison)
 def write_comparison(found: ModelComparison) -> str:
     """Return what is best, and a row for each model.

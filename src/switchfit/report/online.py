@@ -32,9 +32,6 @@ QUANTILE = 1.96
 """Half the width of a 95 % band, in standard errors."""
 
 
-# --- what an online estimator said -----------------------------------------------------------------------------------
-
-
 @format_text.register(OnlineLog)
 def write_log(log: OnlineLog) -> str:
     """Return the present mode, the modes with their times, parameters, alarms, and how long updates took.

@@ -157,9 +157,6 @@ def list_outputs(result: Fit | Validation, e: int) -> list[tuple[Comparison, int
     return [(data, k) for data in result.comparisons[e] or (states,) for k in range(len(data.names))]
 
 
-# --- parts ------------------------------------------------------------------------------------------------------------
-
-
 def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about_zero: bool = False) -> None:
     """Draw both bands of one output, of a new sample and of the curve; without data, that of a state.
 

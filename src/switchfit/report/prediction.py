@@ -11,8 +11,6 @@ from switchfit.report.style import FIT_COLOUR, LINE, THIN, TRANSITION_COLOUR
 from switchfit.runtime.presentation import Figure, draw_figure
 from switchfit.uncertainty.prediction import Prediction
 
-# --- forecasts --------------------------------------------------------------------------------------------------------
-
 
 @draw_figure.register(Prediction)
 def plot_prediction(prediction: Prediction, *, level: float = 0.95) -> Figure:

@@ -21,8 +21,6 @@ from switchfit.report.tables import format_table
 from switchfit.report.times import format_time
 from switchfit.runtime.presentation import format_text
 
-# --- a problem before its fit -----------------------------------------------------------------------------------------
-
 
 @format_text.register(Problem)
 def write_problem(problem: Problem, *, full: bool = False) -> str:

@@ -33,9 +33,6 @@ _NARROW = (
 _JUMPS = "the profile jumps at {}: the other unknowns have several minima, and the one that was followed ends there"
 
 
-# --- profiles ---------------------------------------------------------------------------------------------------------
-
-
 @format_text.register(Profile)
 def write_profile(profile: Profile) -> str:
     """Return the estimate, both intervals, and the notes.

@@ -15,9 +15,6 @@ MOST_DRAWN_CHANNELS = 10
 """Largest number of channels in one figure."""
 
 
-# --- residuals --------------------------------------------------------------------------------------------------------
-
-
 @format_text.register(ResidualDiagnostics)
 def write_diagnostics(diagnostics: ResidualDiagnostics) -> str:
     """Return a line for each channel, and the tests that fail.

@@ -15,8 +15,6 @@ from switchfit.strategy.validation import Validation, convert_to_percent
 from switchfit.uncertainty.explained_variance import explain_channel
 from switchfit.uncertainty.residuals import list_channels
 
-# --- validation -------------------------------------------------------------------------------------------------------
-
 
 @format_text.register(Validation)
 def write_validation(found: Validation) -> str:

@@ -12,8 +12,6 @@ from switchfit.runtime.presentation import join_first
 ALLOWED = "Standard errors allow for the correlation of the residuals."
 """Below a table whose standard errors are corrected."""
 
-# --- verdict ----------------------------------------------------------------------------------------------------------
-
 LISTED_NAMES = 3
 """Names that a sentence lists; the data has all of them."""
 

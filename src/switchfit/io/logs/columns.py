@@ -21,8 +21,6 @@ from switchfit.runtime.errors import InputError
 EPOCH_SECONDS = (9.4e8, 2.6e9)
 """Between which numbers seconds since 1970 lie: the years 1999 to 2052."""
 
-# --- from columns to a log --------------------------------------------------------------------------------------------
-
 _NAMES = (
     re.compile(
         r"_*(t|times?|timestamps?|stamp|zeit|utc|clock|date_?time|secs?|seconds|millis|micros|elapsed.*|.*[ _]elapsed)"

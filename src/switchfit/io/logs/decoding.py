@@ -14,9 +14,6 @@ from switchfit.runtime.files import explain_read_errors
 GZIP = b"\x1f\x8b"
 
 
-# --- from bytes to cells ----------------------------------------------------------------------------------------------
-
-
 def decode(path: Path) -> str:
     """Return the text of a file: UTF-8 or UTF-16 by its byte order mark, UTF-8, or else Latin-1.
 

@@ -19,9 +19,6 @@ NumberedRow = tuple[int, list[str]]
 """Number of a line, and its cells."""
 
 
-# --- the header -------------------------------------------------------------------------------------------------------
-
-
 def find_delimiter(lines: Sequence[NumberedLine]) -> str:
     """Return the delimiter that splits most of the lines into the same number of fields, more than one."""
 

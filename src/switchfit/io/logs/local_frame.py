@@ -19,8 +19,6 @@ from switchfit.problem.validation.messages import shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.extras import import_library
 
-# --- positions --------------------------------------------------------------------------------------------------------
-
 LOCAL_CHANNELS = ("east", "north", "up")
 """Names of the channels of the local frame, in metres."""
 

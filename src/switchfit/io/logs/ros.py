@@ -136,9 +136,6 @@ def _read_stamp(message: Message) -> int:
     return 0 if stamp is None else int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
-# --- types of messages ------------------------------------------------------------------------------------------------
-
-
 def _read_fix(message: Message) -> Record:
     position = ("latitude", "longitude", "altitude")
     # Receivers go on sending without a fix, with the last position or zeros.

@@ -78,9 +78,6 @@ def read_text(path: Path, options: Options) -> Log:
     )  # fmt: skip
 
 
-# --- from cells to numbers --------------------------------------------------------------------------------------------
-
-
 def _find_column(table: TextTable, name: str) -> int:
     count = table.names.count(name)
     if count > 1:

@@ -95,9 +95,6 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     return environment.get_template("report.html").render(content)
 
 
-# --- figures ----------------------------------------------------------------------------------------------------------
-
-
 def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the runs that are shown, the one that is explained worst first, and the JSON of their figures."""
     order = rank_runs(estimate)[:MOST_RUNS_IN_PAGE]
