@@ -50,6 +50,7 @@ def describe_ends(
         Sum of `switchfit.fit.data_variation.measure_variation` over the experiments.
     """
     unknowns, priors = problem.unknowns, problem.unknowns.priors
+    # The priors' part of J explains no data.
     squares = cost - np.array([priors.evaluate(each)[0] for each in theta]) if priors.any else cost
     with np.errstate(divide="ignore", invalid="ignore"):
         explained = np.where(variation == 0, squares <= 0, 1 - squares / variation)
@@ -108,6 +109,7 @@ def _find_smallest(H: FloatArray, free: NDArray[np.int64], status: NDArray[np.st
     """Return the smallest eigenvalue of each scaled Hessian, infinite where a constraint is active: (R,)."""
     found = np.where(status == Status.SINGULAR.name, 0.0, np.inf)
     diagonal = np.diagonal(H, axis1=1, axis2=2)
+    # All of equal size in one call. Fits with fewer free directions would each need a basis of their own.
     whole = (free == H.shape[1]) & np.isfinite(H).all(axis=(1, 2)) & (diagonal > 0).all(axis=1)
     if whole.any():
         scale = diagonal[whole] ** -0.5

@@ -1,4 +1,8 @@
-"""Where many fits ended: arrays with one entry a fit."""
+"""Where many fits ended: arrays with one entry a fit.
+
+`Ends` are those of finished fits, a part of `Fits`; a `Chunk` is the same while its fits are done, which may be done
+again and replaced one by one.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Many fits of one model, as arrays with one entry a fit, and the verdict on them."""
+"""Many fits of one model, as arrays with one entry a fit, and the verdict on them.
+
+`Fits` is what `estimate_many` returns, and what the results of Monte Carlo studies, bootstraps and multistarts are
+made of. It has nothing of the models: levels, intervals and doubts follow from the arrays, so that a file of them is
+as good as the run itself.
+"""
 
 from __future__ import annotations
 

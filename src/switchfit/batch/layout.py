@@ -50,6 +50,7 @@ def has_gpu() -> bool:
 
 def choose_chunk_size(problem: Problem) -> int:
     """Return how many fits of a problem are a chunk."""
+    # Without a GPU nothing runs in lockstep, and the layout need not be known.
     return choose_layout(evaluator_of(problem)).size if has_gpu() else CHUNK
 
 

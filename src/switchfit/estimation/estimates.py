@@ -188,6 +188,7 @@ class Estimate(JudgedFit, Tabular, Displayed):
         'good'
         """
         found = validate(self, other, refit=refit)
+        # The room below knows fits without a facade; what comes out here has its methods.
         return found if found.refit is None else replace(found, refit=Estimate.take_over(found.refit))
 
     def plot(self, *, bands: bool = True, level: float = 0.95) -> Figure:

@@ -50,6 +50,7 @@ class Certifier:
         rtol, atol = self.given.rtol, self.given.atol
         problem = replace(searched, experiments=runs, min_duration=shortest, rtol=rtol, atol=atol)
         first, acting = fitted.switches, fitted.acting
+        # Fixed where they do not act: the Hessian has no row of zeros, and the report no unknown without effect.
         spans = problem.unknowns.parameters.values()
         # The entries of an array are estimated all together, or none of them.
         idle = [range(s.start, s.stop) for s in spans if not acting[s.start - first : s.stop - first].any()]

@@ -19,6 +19,7 @@ SIGMA_OF_MEDIAN = 1.4826
 
 def count_outliers(estimate: Estimate) -> int:
     """Return the number of outliers of a fit, in all channels."""
+    # By the median, which outliers do not move as they move a root mean square.
     sizes = [np.abs(channel.values) for channel in estimate.residuals.channels]
     return sum(int(np.sum(size > OUTLIER_FROM * SIGMA_OF_MEDIAN * np.median(size))) for size in sizes)
 
@@ -39,6 +40,7 @@ def assume_fault(problem: Problem, fault: str, estimate: Estimate) -> Problem:
         data = []
         for item in run.data:
             if isinstance(item, Measurements):
+                # Channels come in the order of the data, one for each column of each item.
                 factors = [next(sizes, 1.0) for _ in range(item.values.shape[1])]
                 change = {"loss": "huber"} if fault == "outliers" else {"sigma": np.asarray(item.sigma) * factors}
                 item = replace(item, **change)

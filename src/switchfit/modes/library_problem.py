@@ -35,6 +35,7 @@ def build_library_problem(problem: Problem, library: Library) -> Problem:
     for run in problem.experiments:
         schedule = _choose_schedule(run, library)
         runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(schedule.times)))
+    # Jumps at known times are transitions of the structure, and need room as well.
     jumps = max(len(run.jump_times) for run in runs)
     most = max(library.max_switches, 1) + jumps
     changes: dict[str, Any] = {"system": system, "experiments": runs, "min_duration": dict(library.durations)}
@@ -45,6 +46,7 @@ def _choose_schedule(run: Experiment, library: Library) -> Schedule:
     """Return a schedule of the library, with a switch if there is one: there is then something to estimate."""
     given = tuple(run.mode_sequence)
     sequences = [given] if len(given) > 1 and library.admits(given) else []
+    # With one switch or more first: without any there may be nothing to estimate.
     for switches in sorted(library.possible_switches, key=lambda k: (k == 0, k)):
         sequences.append(next(library.list_sequences(switches)))
     for sequence in sequences:

@@ -80,6 +80,7 @@ def _fit_neighbours(improver: Improver, best: Fitted) -> dict[tuple[int, str], M
     every = improver.simulate(best, list_neighbours)
     for cost, changed, e in every:
         schedule = best.schedules[e]
+        # More modes at the same J: what is measured does not tell whether they were active.
         if changed.switches > schedule.switches and abs(cost - best.cost) <= CHANGE_WITHOUT_TRACE * best.cost:
             mode, begin, end = _find_change(schedule, changed)
             name, unit = problem.run_names[e] if several else "", problem.experiments[e].time_unit
@@ -103,6 +104,7 @@ def _find_change(schedule: Schedule, changed: Schedule) -> tuple[str, float, flo
     middles = 0.5 * (knots[:-1] + knots[1:])
     before = [schedule.sequence[k] for k in np.searchsorted(schedule.times, middles)]
     after = [changed.sequence[k] for k in np.searchsorted(changed.times, middles)]
+    # There is one: every neighbour has other modes or other times.
     first = next(k for k in range(len(middles)) if before[k] != after[k])
     span = list(takewhile(lambda k: after[k] == after[first] != before[k], range(first, len(middles))))
     return after[first], float(knots[first]), float(knots[span[-1] + 1])

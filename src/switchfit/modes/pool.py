@@ -42,6 +42,7 @@ class Pool:
 
     def add(self, fitted: Fitted) -> None:
         """Add a fit, unless it failed or the same sequence has a lower one."""
+        # One fit a sequence: what is compared are sequences, each at its best.
         known = self._found.get(fitted.sequences)
         if not fitted.failed and (known is None or fitted.cost < known.cost):
             self._found[fitted.sequences] = fitted
@@ -49,6 +50,8 @@ class Pool:
     def compute(self, fitted: Fitted, criterion: CriterionName | None = None, *, discounted: bool = True) -> float:
         """Return a criterion of a fit, by default that of the search."""
         name, score = criterion or self.criterion, self.score if discounted else self.undiscounted
+        # An information criterion counts unknowns, and the time of a guarded transition is none; its price is paid all
+        # the same.
         switches = fitted.switches if name == "cost" else fitted.free_switches
         return score.compute(name, fitted.cost, int(fitted.acting.sum()), switches)
 
@@ -64,6 +67,8 @@ class Pool:
         ----------
         score : Score
         """
+        # By the criterion before: where a discount makes another sequence the best, that is said
+        # (`ModeStatus.AMBIGUOUS`).
         self.as_it_stands = self.best
         self.score, self.criterion = score, "mbic"
 
@@ -91,6 +96,7 @@ class Pool:
     def by_switches(self) -> dict[int, Fitted]:
         """The fit of the lowest cost for each number of switches, ascending."""
         found: dict[int, Fitted] = {}
+        # The lowest cost first, so that it is kept.
         for fitted in sorted(self, key=lambda fitted: fitted.cost):
             found.setdefault(fitted.switches, fitted)
         return dict(sorted(found.items()))

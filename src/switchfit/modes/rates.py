@@ -246,6 +246,7 @@ def compute_rates(evaluator: Evaluator, theta: FloatArray) -> tuple[Insertion, .
 def _rate_pulses(system: HybridSystem, rows: Costates, slopes: FloatArray) -> FloatArray:
     """Return ``psi . (f_k - f_m)`` at the starts of rows, NaN where a pulse is no small change: (R, K)."""
     names = tuple(system.modes)
+    # Vector fields of all modes at each row's start, of which the active one is taken away.
     active = slopes[np.arange(len(slopes)), rows.modes]
     with np.errstate(all="ignore"):  # a mode may not be defined at states where it never is active
         rate = np.einsum("rn,rkn->rk", rows.costates, slopes[:, : len(names)] - active[:, None])

@@ -180,6 +180,7 @@ def _check_criterion(
         raise ValueError(f"switch_cost must be zero or positive; got {each}.")
     score = Score.of(problem, each)
     if switch_cost is not None:
+        # "bic" is the default: who gives a switch_cost and no criterion means that cost.
         if chooser not in ("bic", "cost"):
             raise ValueError(
                 f"switch_cost is the cost of a switch for criterion='cost'; got criterion={shorten(criterion)} beside "

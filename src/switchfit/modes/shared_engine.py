@@ -37,6 +37,8 @@ class SharedEngine(NativeEngine):
     def at(self, order: Order) -> NativeExperiment | None:
         """Return the experiment with derivatives of an order, set to this sequence."""
         found = super().at(order)
+        # Sequences take turns in one experiment, whose arrays say which modes are active: they are set only where
+        # another one was there before.
         if found is not None and found.structure is not self._structure:
             found.assign_sequence(self._structure, places_in_library(self._structure))
         return found

@@ -27,10 +27,12 @@ def propose_starts(fitter: Fitter) -> list[FloatArray]:
         sd = np.where(precision > 0, precision**-0.5, 0.0)
     changed = []
     for factor, sign in zip(FACTORS, (-1, 1), strict=True):
+        # A prior says how far off a guess may be; a factor is for guesses of which nothing is known.
         by_prior = np.where(log, guess * np.exp(sign * sd), guess + sign * sd)
         changed.append(np.clip(np.where(precision > 0, by_prior, factor * guess), lower, upper))
     starts = [guess, *changed]
     if 1 < len(guess) <= MOST_ALONE:
         places = np.arange(len(guess))
         starts += [np.where(places == i, moved, guess) for i in places for moved in changed]
+    # Fixed bounds, and zeros, make starts equal: each is searched from once.
     return list({start.tobytes(): start for start in starts}.values())

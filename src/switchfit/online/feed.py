@@ -1,4 +1,8 @@
-"""The nodes, signals and samples of a log that grows, in arrays that machine code reads in place."""
+"""The nodes, signals and samples of a log that grows, in arrays that machine code reads in place.
+
+The arrays have room for the whole capacity from the beginning and never move, since compiled programs hold their
+addresses; of each only the beginning is in use, and what is put in shifts what is behind it.
+"""
 
 from __future__ import annotations
 

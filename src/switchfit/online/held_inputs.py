@@ -68,5 +68,6 @@ class HeldInputs:
             return
         if end > whole.knots[-1] and whole.coefficients[-1, 1:].any():
             raise ValueError(f"the inputs of the problem end at {whole.knots[-1]:.9g}: give u from then on.")
+        # By the middle of the cell: its ends may be knots, which belong to two pieces.
         k = int(whole.interval(np.array([0.5 * (begin + end)]))[0])
         into[:] = shift_cubic(whole.coefficients[k], begin - whole.knots[k])

@@ -177,6 +177,7 @@ class Now:
     def mode_probability(self) -> dict[str, float]:
         """Share of the hypotheses that are in each mode, weighted by their likelihood and the price of a change."""
         mode, value = self.hypotheses
+        # Less the lowest, or all would underflow in a long log.
         share = np.exp(value.min() - value)
         shares = np.bincount(mode, share / share.sum(), len(self.modes))
         return dict(zip(self.modes, shares.tolist(), strict=True))
@@ -194,6 +195,7 @@ class Now:
     def covariance(self) -> FloatArray:
         """Covariance of the state: (n, n); infinite on its diagonal where the samples say nothing."""
         Z, P = self.best.tangent, self._unknowns
+        # An unknown that does not move the state may have an infinite variance: 0 times infinity is no number.
         used = (Z != 0).any(0)
         return np.asarray(Z[:, used] @ P[np.ix_(used, used)] @ Z[:, used].T)
 

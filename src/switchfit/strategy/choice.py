@@ -1,4 +1,9 @@
-"""What `estimate` does: one fit, and strategies that need no first guess where its verdict is not good."""
+"""What `estimate` does: one fit, and strategies that need no first guess where its verdict is not good.
+
+Three ways lead out: the fit is good and no lower minimum is near; it is good but another minimum near by may be lower,
+which is all that is tried then; or a whole `Search` follows. Which of them it is, `stopping` says. How long a search
+may take is counted in work and not in seconds, unless a budget is given.
+"""
 
 from __future__ import annotations
 

@@ -43,15 +43,19 @@ def look_beyond_corners(
     for place in np.flatnonzero(errors > 0.0):
         for side in (-1.0, 1.0):
             for distance in ERRORS_BEYOND:
+                # Along the column of the covariance: the valley of J, in which the others follow this unknown.
                 point = theta + side * distance / errors[place] * covariance[:, place]
                 point = make_feasible(evaluator.problem, point)
                 check_time()
+                # Farther out on this side it would not be finite either.
                 if not np.isfinite(evaluator.cost(point)):
                     break
                 if evaluator.paths == path:
                     continue
                 for matrix in MATRICES:
                     there = evaluator(point, matrix=matrix)
+                    # J is smooth on one path: the model about the first point on another one says how low J may be
+                    # there.
                     found = minimize_quadratic(there.gradient, there.hessian, errors > 0.0, int(place), -np.inf, np.inf)
                     if found is not None:
                         break

@@ -1,4 +1,9 @@
-"""Beams over all runs of a problem, each in turn: what the others say about shared parameters is a quadratic."""
+"""Beams over all runs of a problem, each in turn: what the others say about shared parameters is a quadratic.
+
+Run e says of the shared parameters q that they cost ``q'A_e q / 2 - b_e'q``, its own parameters and times following
+(`Proposal.evidence`). The beam of a run is given the sum over all others; what it said before is replaced by what it
+says then, so that no data count twice.
+"""
 
 from __future__ import annotations
 

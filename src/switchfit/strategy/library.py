@@ -63,6 +63,7 @@ class Library:
         """The modes from which a sequence can end after k more switches, for k = 0 ... max_switches."""
         found = [frozenset(self.last)]
         for _ in range(self.max_switches):
+            # Backwards from the last modes: those with a follower from which k - 1 switches lead to the end.
             found.append(frozenset(mode for mode in self.modes if found[-1] & set(self.successions[mode])))
         return found
 
@@ -106,6 +107,7 @@ def build_library(
     begins, ends = _choose_modes(first, "first", names), _choose_modes(last, "last", names)
     followers = _check_successions(successions, names)
     found = Library(names, begins, ends, followers, _read_durations(problem, min_duration, names), most)
+    # A shortest way visits no mode twice: with as many switches as modes, every `last` that can be reached at all is.
     if not replace(found, max_switches=len(names)).possible_switches:  # however many switches there may be
         raise ValueError(
             f"no mode of last ({join_names(ends)}) can be reached from first ({join_names(begins)}) by the "

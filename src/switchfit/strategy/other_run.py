@@ -1,4 +1,8 @@
-"""The problem of another run from a fit: its parameters, and what the run says of itself."""
+"""The problem of another run from a fit: its parameters, and what the run says of itself.
+
+The other run may be given whole, as an experiment or a problem, or as a log alone; then it is the fit's only experiment
+with other data, and whatever the log leaves out is as it was there. `validate` alone asks for it.
+"""
 
 from __future__ import annotations
 

@@ -29,6 +29,7 @@ class Quadratic(NamedTuple):
         if len(others):
             cross = self.Q[np.ix_(places, others)]
             solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)
+            # Schur complement. The pseudo-inverse leaves directions alone of which the data say nothing.
             g, Q = g - cross @ solved @ self.g[others], Q - cross @ solved @ cross.T
         return Quadratic(self.center[places], g, Q)
 

@@ -1,4 +1,9 @@
-"""Mode sequences of many hypotheses, as arrays: which births may follow, and which hypotheses are kept."""
+"""Mode sequences of many hypotheses, as arrays: which births may follow, and which hypotheses are kept.
+
+A beam and an online estimator step from node to node in the same way: `Rules` list the births, `list_children` has
+those that go on and then the births, the engine takes all of them to the next node, `select_lowest` chooses, and
+`follow` keeps what was chosen. Nothing here knows a state, and of a cost only its value.
+"""
 
 from __future__ import annotations
 

@@ -101,5 +101,6 @@ def make_feasible(problem: Problem, theta: FloatArray) -> FloatArray:
     theta = np.clip(theta, problem.unknowns.lowest, problem.unknowns.upper)
     for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
         free = where[where >= 0]
+        # Equal times are feasible, as a mode of no length; minimum durations are left to the fit's constraints.
         theta[free] = np.maximum.accumulate(np.clip(theta[free], run.t0, run.end))
     return theta

@@ -36,6 +36,7 @@ def limit_time(
 
 def is_late() -> bool:
     """Return whether the time budget is spent."""
+    # A context variable: a search in one thread does not limit what others do.
     return _is_late.get()()
 
 

@@ -32,5 +32,6 @@ def compare_with_sigma(
     with np.errstate(divide="ignore", invalid="ignore"):
         above, below = special.chdtrc(freedom, chi_square), special.chdtr(freedom, chi_square)
         ratio = np.asarray(chi_square) / freedom
+    # Both are asked for: an unlikely chi-square, and one that is off by what matters (`CLEARLY_OFF`).
     probability = np.where(ratio > 1 + CLEARLY_OFF, np.minimum(1.0, tests * above), 1.0)
     return probability, ~((tests * below < UNLIKELY_AS_NOISE) & (ratio < 1 - CLEARLY_OFF))

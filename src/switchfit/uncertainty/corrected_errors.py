@@ -36,6 +36,7 @@ def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
         size = theta - origin
         # A factor of the logarithm is a power of the ratio.
         wide = np.where(log, origin + size * ((found - origin) / size) ** factors, theta + factors * (found - theta))
+    # To the bit as they were where nothing is widened.
     wide = np.where(factors > 1.0, wide, found)
     return np.stack([np.maximum(wide[:, 0], fit.lower), np.minimum(wide[:, 1], fit.upper)], axis=1)
 
@@ -73,6 +74,7 @@ def measure_widening(fit: Fit) -> FloatArray:
     for channel, correlated in zip(found.channels, found.correlated, strict=True):
         if correlated:
             factors[channel.experiment] = max(factors[channel.experiment], channel.widening)
+    # A parameter acts in all runs, so that the worst of them counts; a transition time is known by its own run alone.
     each *= factors.max(initial=1.0)
     for factor, places in zip(factors, fit.transition_places, strict=True):
         each[places[places >= 0]] = factor

@@ -51,6 +51,7 @@ def disagreement(fit: Fit) -> Disagreement | None:
         root = size[:, None] * vectors / np.sqrt(values)  # root' one root = 1
         ratios.append(float(np.linalg.eigvalsh(root.T @ other @ root)[-1]))
     held = errors[0] <= 0
+    # Logarithms, as either of the two may be the larger one. Unknowns that are held have 0 in both.
     changes = np.where(held, 0.0, np.abs(np.log(np.where(held, 1.0, errors[0]) / np.where(held, 1.0, errors[1]))))
     k = int(np.argmax(changes))
     return Disagreement(max(ratios) ** 0.5, fit.theta_names[k], float(errors[0][k]), float(errors[1][k]))

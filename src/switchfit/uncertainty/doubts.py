@@ -135,12 +135,16 @@ def _list_doubts(fits: Numbers) -> Iterator[Doubt]:
     yield Doubt("not converged", "bad", ~ended)
     yield Doubt("integration error", "bad", ended & np.logical_not(fits.error <= FINE))
     yield Doubt("other starts are better", "bad", (fits.lower > 0) & ~exact)  # nothing is better than 0
+    # Where noise of a known size is all that is left, no other end can be much lower. Otherwise two starts that agree
+    # have to stand in for that.
     confirmed = noise & (known | exact | ((fits.agreeing >= 2) & (share >= NEARLY_ALL)))
+    # A start that ended lower is a doubt of its own kind.
     lonely = (fits.lower == 0) & (fits.agreeing < AGREEING * fits.tried)
     yield Doubt("few starts agree", "doubtful", lonely & ~confirmed)
     unexplained = judged & (share < HALF) & ~noise
     no_noise = judged & (share >= HALF) & tested & ~noise
     wanted = np.where(noise, HALF, MOSTLY) if not fits.references else NEARLY_ALL
+    # Only one finding about how much is explained: the weaker ones leave out what a stronger one has said.
     little = judged & (share < wanted) & ~known & ~unexplained & ~no_noise
     yield Doubt("unexplained", "bad", unexplained)
     yield Doubt("no noise", "doubtful", no_noise)

@@ -81,6 +81,7 @@ def explain_all(runs: Sequence[Sequence[Comparison]]) -> float:
         for k in range(len(comparison.names)):
             squares, spread, size = sum_squares(comparison, k)
             if np.isfinite(squares) and spread > 0:
+                # Each channel in units of its own noise: metres and degrees add up.
                 left, total = left + squares / size, total + spread / size
     return 1 - left / total if total > 0 else np.nan
 
@@ -93,8 +94,10 @@ def sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
     there = np.isfinite(residual)
     if not there.any() or (comparison.weights is not None and comparison.weights[k] == 0):
         return np.nan, np.nan, 1.0
+    # There is no telling outliers from a wrong fit without the size of the noise.
     if comparison.downweighted is not None and comparison.sigma is not None:
         outliers = comparison.downweighted[there, k]
+        # Indexed by itself: `outliers` has an entry only for values that are there.
         there[there] = ~outliers | (not are_outliers(outliers, residual[there] / comparison.sigma[there, k]))
     weight = _compute_weights(comparison)[there]
     y, residual = y[there], residual[there]
@@ -105,6 +108,7 @@ def sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
         size = 1.0 / float(comparison.weights[k])
     mean = float(weight @ y / weight.sum()) if weight.sum() > 0 else 0.0
     spread, about_zero = float(weight @ (y - mean) ** 2), float(weight @ y**2)
+    # Values that do not vary have a spread of rounding, of which any residual is a multiple.
     if spread <= NO_VARIATION**2 * about_zero:
         spread = about_zero if comparison.kind == "measurements" else 0.0
     return float(weight @ residual**2), spread, size if size > 0 else 1.0
@@ -120,4 +124,5 @@ def _compute_weights(comparison: Comparison) -> FloatArray:
     if comparison.kind == "measurements":
         return np.ones(len(comparison.times))
     steps = np.diff(comparison.times)
+    # Half a step from each side, so that a mesh that is fine somewhere does not count more there.
     return 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))

@@ -145,6 +145,7 @@ def find_weakest(fit: Fit) -> tuple[float, tuple[str, ...]]:
 
 def _find_missing_errors(fit: Fit, smallest: float) -> Iterator[Issue]:
     """Find the reason why a fit has no standard errors; `smallest`: of the eigenvalues of its scaled Hessian."""
+    # Unknowns without effect have no error either, and have said why.
     missing = ~np.isfinite(fit.standard_errors) & ~np.isin(fit.theta_names, list_without_effect(fit))
     if not missing.any() or not np.isfinite(fit.hessian).all():
         return

@@ -184,6 +184,7 @@ class JudgedFit(SolvedFit):
         """
         rows = sum(len(mesh.nodes) for mesh in self.evaluator_at_solution().meshes)
         width = 2 * max(trajectory.states.shape[1] for trajectory in self.trajectories)  # about as many outputs
+        # Before and after each row, 8 bytes each.
         return 16 * rows * width * len(self.theta) <= MOST_SENSITIVITIES
 
     @cached_property

@@ -78,6 +78,7 @@ def find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArr
         length, height, last = side * (stop - start), thresholds - rise, np.isnan(after)
         with np.errstate(invalid="ignore", divide="ignore"):
             parabola = find_first_root(height, slope, curvature)
+            # The next piece's rise is J itself, where the parabola is a prediction: the cubic meets both ends.
             cubic, risen = np.full_like(found, np.inf), searched & (after >= thresholds)
             if risen.any():
                 cubic = np.where(risen, _bisect(after - rise, slope, curvature, length, height), np.inf)
@@ -85,6 +86,7 @@ def find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArr
             jumps = (after >= thresholds) & (after - said > JUMP_BETWEEN_PIECES * after)
             cubic = np.where(jumps, np.minimum(parabola, length), cubic)
             reach = np.where(height <= 0, 0.0, np.where(last, parabola, cubic))
+        # Of many profiles at once, some have fewer pieces: theirs end here.
         searched &= ~np.isnan(start)
         found = np.where(searched, start + side * np.minimum(reach, length), found)
         searched &= ~(reach <= length)

@@ -62,9 +62,11 @@ def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
         free, times = where >= 0, experiment.initial_times
         gaps = np.array([problem.durations[mode] for mode in experiment.mode_sequence])  # before each time
         latest = np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
+        # A fixed time limits its neighbours like a bound; index -1 of its place reads a value that is not taken.
         first, last = np.where(free, [low[where], high[where]], times)
         # Without the gaps before them, times are in order.
         ahead = np.cumsum(gaps)[: len(where)]
+        # As in `keep_apart`: with the minimum durations before them taken off, order is all that is left.
         earlier = np.maximum.accumulate(np.maximum(first - ahead, experiment.t0)) + ahead
         later = np.minimum.accumulate(np.minimum(last - ahead, latest - ahead[-1:])[::-1])[::-1] + ahead
         own = where[free]

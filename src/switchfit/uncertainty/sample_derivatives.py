@@ -60,6 +60,7 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
             sigma = item.noise(problem.name_parameters(found.theta, e))
             residual = (points.outputs[:, channels] - np.nan_to_num(item.values))[there]
             weight = np.ones(len(residual)) if sigma is None else sigma[there] ** -2.0
+            # rho' of the loss: how much of a residual counts for the gradient.
             pull = influence(item.loss, item.loss_scale, weight * residual**2)
             places = np.full(len(residual), e), np.full(len(residual), k)
             columns.append((*places, residual, weight, pull, points.outputs_d[:, channels][there]))

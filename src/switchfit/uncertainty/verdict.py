@@ -118,6 +118,8 @@ def _list_numbers(fit: Fit, quality: Quality | None) -> Numbers:
     ended = Numbers(np.array([fit.status.successful]), fit.integration_error, lower, tried, agreeing)
     if quality is None:
         return ended
+    # An unknown without effect makes the Hessian singular too, but has a finding of its own; all others may be
+    # determined.
     is_flat = fit.status is Status.SINGULAR and not list_without_effect(fit)
     found = replace(
         ended,
@@ -125,6 +127,7 @@ def _list_numbers(fit: Fit, quality: Quality | None) -> Numbers:
         at_bounds=len(list(find_active_bounds(fit))) if any(fit.comparisons) else 0,
         smallest=0.0 if is_flat else find_weakest(fit)[0],
     )
+    # A cost without data: no share is explained, and integration error was judged with `ended`.
     if not quality.channels:
         return found
     is_exact = 1 - quality.explained < NO_RESIDUALS and fit.integration_error_of == "J"
