@@ -375,7 +375,7 @@ BY_HAND: dict[str, dict[str, Mistake]] = {
             "online", "changed = min(changed, node)", "changed = min(changed, node + 1)"
         ),
         "a late sample keeps its time stamp": swap(
-            "online", "t - float(self._sensors[k].delay)", "t - 0 * float(self._sensors[k].delay)"
+            "online", "t - float(self._sensors.items[k].delay)", "t - 0 * float(self._sensors.items[k].delay)"
         ),
         "a model that has lost the samples recovers": swap("online", "self._lost = now", "self._lost = None"),
         "inputs hold before they come": swap("online", "return given if before is None else before", "return given"),
