@@ -184,8 +184,8 @@ class Batch:
                 warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=3)
             return Outcome.at_starts(starts, np)
         outcome: Outcome = jax.tree.map(lambda a: a[: len(starts)], found)
-        # A program has one mesh for all fits: it is refused where it does not suit the first and the last of them.
-        # The program takes all fits or none, so that these two stand for the others.
+        # A program has one mesh for all fits, and takes all of them or none: it is refused where the mesh does not suit
+        # the first and the last, which stand for the others.
         is_sharp = self.layout.natively and not all(map(Follower(self.evaluator).suits, outcome.theta[[0, -1]]))
         return Outcome.at_starts(starts, np) if is_sharp else outcome
 

@@ -30,6 +30,7 @@ def build_library_problem(problem: Problem, library: Library) -> Problem:
         def inside(functions: Mapping[tuple[str, str], Any]) -> dict[tuple[str, str], Any]:
             return {pair: function for pair, function in functions.items() if set(pair) <= set(kept)}
 
+        # Functions of transitions that the library cannot make would be traced and compiled for nothing.
         system = replace(system, modes=kept, reset_maps=inside(system.reset_maps), guards=inside(system.guards))
     runs = []
     for run in problem.experiments:
@@ -46,7 +47,6 @@ def _choose_schedule(run: Experiment, library: Library) -> Schedule:
     """Return a schedule of the library, with a switch if there is one: there is then something to estimate."""
     given = tuple(run.mode_sequence)
     sequences = [given] if len(given) > 1 and library.admits(given) else []
-    # With one switch or more first: without any there may be nothing to estimate.
     for switches in sorted(library.possible_switches, key=lambda k: (k == 0, k)):
         sequences.append(next(library.list_sequences(switches)))
     for sequence in sequences:

@@ -175,7 +175,10 @@ class OnlineEstimator:
         self._given_settings["capacity"] = self.capacity
         if walks and window is None:
             raise ValueError("drift acts on what is known from before the window: set window=.")
+        # What is before a window is a shift of its first state, n entries; without a window, or new values, there is
+        # none.
         entries, slots = problem.structures[0].n if window is not None or renewed else 0, max(births, 1)
+        # Entries take slots of births: the engine knows no other unknowns of a hypothesis than times and p.
         self._beam = Beam(problem, 0, replace(library, max_switches=slots + entries))
         if self._beam.corners:
             where = ", ".join(self._beam.corners)
@@ -677,7 +680,6 @@ class OnlineEstimator:
         common = int(np.minimum.accumulate(declared[: len(modes)] == modes[: len(declared)]).sum())
         count = len(declared) - common
         retracted = self._alarms[-count] if 0 < count <= len(self._alarms) else None
-        # Alarms of changes that the new sequence does not have.
         if count:
             del self._alarms[-count:]
         self._tracker.declared = modes.copy()

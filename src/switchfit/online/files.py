@@ -37,6 +37,7 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
 def append_update(path: Path, t: float, y: dict[int, FloatArray], u: ArrayLike | Mapping[str, float] | None) -> None:
     """Write an update to a journal, with the values of each sensor; it leaves the process before the update begins."""
     line = json.dumps({"t": t, "y": y, "u": u}, default=lambda value: np.asarray(value, dtype=np.float64).tolist())
+    # Unbuffered: one write hands the line to the system, which keeps it when the process is killed.
     with path.open("ab", buffering=0) as file:
         file.write(line.encode() + b"\n")
 
@@ -44,6 +45,7 @@ def append_update(path: Path, t: float, y: dict[int, FloatArray], u: ArrayLike |
 def read_journal(path: Path) -> list[tuple[float, Any, Any]]:
     """Return the updates of a journal, none without a file; a last one that was cut off is taken out of it."""
     written = path.read_bytes() if path.exists() else b""
+    # A line without its end was cut off by a kill; the next update would be written behind it.
     whole, _, cut_off = written.rpartition(b"\n")
     found = []
     for line in whole.splitlines():

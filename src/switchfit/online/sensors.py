@@ -62,6 +62,7 @@ class Sensors:
         for row in found.values():
             if np.isinf(row).any():
                 raise ValueError(f"y must be finite, or NaN where a value is missing; got {shorten(row.tolist())}.")
+        # A sensor of which all values are missing has said nothing: it takes no place in the log.
         return {k: row for k, row in found.items() if np.isfinite(row).any()}
 
 

@@ -332,7 +332,7 @@ class Tracker:
         there.moved[:, : A + S] = 0.0
         pasts = []
         # Transitions that are behind the new start become entries e, one after the other; for each one combination of n
-        # + 1 directions has no effect on the state, and is eliminated (`window`).
+        # + 1 directions has no effect on the state, and is eliminated (`window_start`).
         for _ in range(gone):
             pasts.append(Past.of(there.tangents[0], A, S))
             pasts[-1].absorb(there, self.birth_information)

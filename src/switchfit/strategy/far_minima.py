@@ -66,8 +66,8 @@ def find_far_minima(
                 found.append((there, point))
             if there < least:
                 least, best = there, point
-            # `not >` rather than `<=`: J that is no number ends the dip as well.
-            # A model that is right and not lower than the cost has nothing to tell.
+            # A model that is right and not lower than the cost has nothing to tell. `not >` rather than `<=`: J that is
+            # no number ends the dip as well.
             if not there > cost or abs(there - lowest) < MODEL_RIGHT * (lowest - cost):
                 break
             lowest, start = find_lowest(point)

@@ -45,7 +45,6 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
         for begin, end, group in _list_stretches(experiment, where):
             # Sorted uniform numbers are uniform over all ordered times; minimum durations are added to their gaps.
             room = end - begin - (len(group) + 1) * shortest
-            # Sorted uniform numbers are uniform over all orders of times: no start is lost to times in a wrong order.
             ordered = np.sort(cube[:, group], axis=1)
             if unknowns.log[group].all():
                 first = unknowns.initial[group[0]] - experiment.t0

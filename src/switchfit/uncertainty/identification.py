@@ -309,7 +309,6 @@ def analyse(
     # Unknowns on which the cost does not depend at all are reported separately.
     without = moves_by_itself(basis) & np.all(hessian == 0.0, axis=1)
     values, vectors, size = compute_scaled_spectrum(hessian, basis)
-    # Each unknown without effect has an eigenvector of its own, with eigenvalue 0: named apart, it is no combination.
     kept = ~(np.sum(vectors[without] ** 2, axis=0) > 0.5)
     values, vectors = values[kept], vectors[:, kept]
     shown = min(max(int(np.sum(values < WEAK)), 1), MOST_DIRECTIONS)  # the worst in any case

@@ -66,7 +66,6 @@ def limit_unknowns(problem: Problem) -> tuple[FloatArray, FloatArray]:
         first, last = np.where(free, [low[where], high[where]], times)
         # Without the gaps before them, times are in order.
         ahead = np.cumsum(gaps)[: len(where)]
-        # As in `keep_apart`: with the minimum durations before them taken off, order is all that is left.
         earlier = np.maximum.accumulate(np.maximum(first - ahead, experiment.t0)) + ahead
         later = np.minimum.accumulate(np.minimum(last - ahead, latest - ahead[-1:])[::-1])[::-1] + ahead
         own = where[free]
