@@ -196,8 +196,7 @@ def bootstrap(
         raise ValueError(f"block is the length of blocks: give it with resample='blocks', not with {resample!r}.")
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
     how = LongRun.check(tolerance, max_iterations, client, folder, callback)
-    # Away from a minimum residuals are not noise, and fits of resampled data would leave the estimate as it would
-    # itself.
+    # Away from a minimum residuals are no noise, and fits of resampled data would go on downhill as this one would.
     if not estimate.status.successful:
         raise ValueError(f"a bootstrap begins at a minimum, and this fit has not found one: {estimate.message}")
     problem = estimate.evaluator_at_solution().problem
@@ -206,7 +205,7 @@ def bootstrap(
     if resample == "runs":
         if len(problem.experiments) < 2:
             raise ValueError("resample='runs' needs two experiments or more; this problem has one. Take 'residuals'.")
-        # The data stay, only weights change: the meshes of the fit are right for every run.
+        # The data stay, only weights change: the meshes of the fit serve every run.
         meshes = list(estimate.evaluator_at_solution().meshes)
         study: Study = StudyOfRuns(problem, meshes, estimate.theta[None], how.limits, seed)
         resampled[np.concatenate([where[where >= 0] for where in problem.unknowns.times])] = False

@@ -131,8 +131,7 @@ def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Generator[t
 
     # Once for all chunks; a study may hold many megabytes of data.
     blob = cloudpickle.dumps(work)
-    # pure=False: Dask would otherwise name tasks by a hash of their arguments, and hand back what an earlier run has
-    # left.
+    # pure=False: Dask would otherwise name tasks by a hash of their arguments, and return results of an earlier run.
     shared, each = client.submit(_receive, blob, pure=False), {"pure": False, "retries": MOST_RETRIES}
     futures = {client.submit(_run_remotely, shared, chunk, **each): chunk for chunk in chunks}
     try:

@@ -196,8 +196,8 @@ class Fits(Ends, Tabular, Displayed):
         log = np.isin(self.theta_names, self.log_scaled)
         # A standard error of 0 is that of an unknown which is held, not of one that is known exactly.
         found = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins)
-        # J may rise by half the squared quantile, in units of the noise: the interval of the profile where there are
-        # pieces.
+        # J may rise by half the squared quantile, in units of the noise: where there are pieces, these say how far that
+        # is.
         thresholds = 0.5 * quantile**2 * measure_variance(self.cost, freedom, self.sigma_known)
         return replace_intervals(found, self.pieces, self.piece_places, thresholds)
 

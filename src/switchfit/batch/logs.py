@@ -102,8 +102,7 @@ def _get_kind(problem: Problem) -> tuple[object, ...]:
     numbers = [unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, *problem.places]
     numbers += [*unknowns.priors, *unknowns.variables]
     times = [experiment.initial_times_with_jumps for experiment in problem.experiments]
-    # Fixed transition times are constants of the program's inputs, of which a group has one set; free ones are in
-    # theta.
+    # Fixed transition times are constants of a program's inputs, one set for a group; free ones are in theta.
     fixed = [np.where(where[: len(t)] < 0, t, 0.0) for where, t in zip(problem.places, times, strict=True)]
     return evaluator.structures, shapes, tuple(np.asarray(a).tobytes() for a in (*numbers, *fixed))
 

@@ -219,8 +219,7 @@ def _find_clusters(fits: Fits) -> NDArray[np.int64]:
     found, lowest = -1, -np.inf
     for k in ended[np.argsort(fits.cost[ended], kind="stable")].tolist():
         cost = float(fits.cost[k])
-        # Compared with the lowest of the cluster, not with its neighbour: a chain of small steps would join minima that
-        # differ.
+        # With the lowest of the cluster, not with its neighbour: a chain of small steps would join minima that differ.
         if not cost - lowest <= SAME_COST * max(abs(cost), 1e-300):
             found, lowest = found + 1, cost
         labels[k] = found

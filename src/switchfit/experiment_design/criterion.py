@@ -57,8 +57,7 @@ class Criterion(NamedTuple):
         xp : module, optional
             NumPy or `jax.numpy`.
         """
-        # In units of typical standard errors F is about 1, and the ridge small against it, whatever the units of theta
-        # are.
+        # In units of typical standard errors F is about 1, and the ridge small against it, in any units of theta.
         basis = self.basis * self.size[None, :]
         across = basis[self.chosen] / self.scales[:, None]
         half = across @ xp.linalg.inv(basis.T @ information @ basis + INFORMATION_RIDGE * xp.eye(len(self.size)))

@@ -74,7 +74,7 @@ def differentiate_criterion(
             slopes, weights = jax.jacfwd(partial(_see, model, side), has_aux=True)(at.theta)
             own = jnp.zeros((at.theta.size, at.theta.size))
             for taken, (C, L), w in zip(at.taken, slopes, weights, strict=True):
-                # sum C'C / sigma^2 of the samples that are taken, and 2 (D log sigma)' D log sigma where sigma is a
+                # sum C'C / sigma^2 of the samples that are taken, and 2 (D log sigma)' D log sigma of a sigma that is a
                 # parameter.
                 own += jnp.einsum("k,kqd,kq,kqe->de", taken, C, w, C) + 2.0 * jnp.einsum("k,kqd,kqe->de", taken, L, L)
             return own

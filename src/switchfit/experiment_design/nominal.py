@@ -56,8 +56,7 @@ class Nominal:
         arguments, (own, mine) = self.evaluator.arguments[e], problem.own_places[e]
         counts = [len(item.times) for item in problem.experiments[e].data]
         for s, count in enumerate(counts):
-            # One sample at a time has a weight, all others 0: what J's matrix is then is the information of this
-            # sample.
+            # One sample at a time has a weight, all others 0: the Gauss-Newton matrix is then its information.
             for k in range(count):
                 weights: list[Any] = [np.zeros_like(each.weight) for each in arguments.samples]
                 weights[s][k] = arguments.samples[s].weight[k]

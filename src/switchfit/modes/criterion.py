@@ -102,8 +102,7 @@ class Score:
         # log n must not be negative: then more unknowns would cost less.
         n = max(self.worth * max(self.values, 1), 1.0)
         if self.sigma_known is False:
-            # n log(2 J / n) is -2 log L but for a constant. J of data without noise is rounding, whose logarithm would
-            # choose.
+            # -2 log L but for a constant. J of data without noise is rounding, whose logarithm would choose.
             misfit, parameters = n * float(np.log(2 * max(cost, self.smallest) / self.values)), parameters + 1
         else:
             misfit = self.worth * 2 * cost / self.dispersion

@@ -118,8 +118,7 @@ class Improver:
             moves = KINDS_OF_MOVES if self.fitter.shares_programs else KINDS_OF_MOVES[:1]
             if any(self._try(best, partial(self._fit_lowest, *move)) for move in moves):
                 continue
-            # Hops come last, when no move of modes helps, and once for each sequence: they take many evaluations of
-            # models.
+            # Hops come last, and once for each sequence: they take many evaluations of models.
             if best.sequences in hopped or not self._try(best, self._hop):
                 return
             hopped.add(best.sequences)

@@ -50,8 +50,7 @@ class Pool:
     def compute(self, fitted: Fitted, criterion: CriterionName | None = None, *, discounted: bool = True) -> float:
         """Return a criterion of a fit, by default that of the search."""
         name, score = criterion or self.criterion, self.score if discounted else self.undiscounted
-        # An information criterion counts unknowns, and the time of a guarded transition is none; its price is paid all
-        # the same.
+        # The time of a guarded transition is no unknown, which an information criterion would count; its price is paid.
         switches = fitted.switches if name == "cost" else fitted.free_switches
         return score.compute(name, fitted.cost, int(fitted.acting.sum()), switches)
 

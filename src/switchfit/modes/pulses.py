@@ -112,7 +112,7 @@ def insert_modes(improver: Improver, schedules: Sequence[Schedule], parameters: 
         candidates = [each for each in pool.by_switches.values() if each.theta.tobytes() not in visited]
         if not candidates:
             break
-        # The best that was not looked at yet, even where it is no better: from there two pulses may pay where one does
+        # The best that was not looked at yet, even if it is no better: from there two pulses may pay where one does
         # not.
         current = min(candidates, key=weigh)
         waited = 0 if is_lower(min(map(weigh, pool)), lowest) else waited + 1

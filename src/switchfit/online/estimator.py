@@ -175,8 +175,7 @@ class OnlineEstimator:
         self._given_settings["capacity"] = self.capacity
         if walks and window is None:
             raise ValueError("drift acts on what is known from before the window: set window=.")
-        # What is before a window is a shift of its first state, n entries; without a window, or new values, there is
-        # none.
+        # What is before a window is a shift of its first state, n entries; with no window, and nothing renewed, none.
         entries, slots = problem.structures[0].n if window is not None or renewed else 0, max(births, 1)
         # Entries take slots of births: the engine knows no other unknowns of a hypothesis than times and p.
         self._beam = Beam(problem, 0, replace(library, max_switches=slots + entries))
@@ -690,8 +689,7 @@ class OnlineEstimator:
         else:  # another mode than was declared since what left the window
             _, time, error = self._tracker.left[-1]
         alarm = Alarm(t, self._beam.modes[modes[-1]], time, error, statistic)
-        # Two changes at once are one alarm, which stands in the list for each of them: a later retraction counts
-        # changes.
+        # Two changes at once are one alarm, which the list has for each of them: a retraction counts changes.
         self._alarms += [alarm] * (len(modes) - common)  # it declares so many changes
         return alarm, retracted
 

@@ -76,8 +76,7 @@ class Feed:
             # A cell that is cut keeps its cubic on the left; on the right it counts from the new node.
             self.signals[node] = shift_cubic(self.signals[node - 1], time - self._nodes[node - 1])
         self._nodes[node] = time
-        # `first[j]` is the number of samples before node j: the new node has none yet, and all behind it move by one
-        # place.
+        # `first[j]` is the number of samples before node j: the new node has none, and all behind it move by one.
         for first, *_ in self._samples:
             first[node + 1 : end + 2] = first[node : end + 1].copy()
         self.count += 1

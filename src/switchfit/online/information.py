@@ -27,8 +27,7 @@ def invert(matrix: FloatArray) -> FloatArray:
     scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     there = np.flatnonzero(scale)
     found = np.diag(np.where(scale > 0, 0.0, np.inf))
-    # Scaled to a unit diagonal: times, rates and masses differ by many decades, and an inverse would lose the small
-    # ones.
+    # Scaled to a unit diagonal: unknowns differ by many decades, and an inverse would lose the small ones.
     sizes = np.outer(scale[there], scale[there])
     try:
         found[np.ix_(there, there)] = np.linalg.inv(matrix[np.ix_(there, there)] / sizes) / sizes

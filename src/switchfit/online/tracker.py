@@ -291,8 +291,7 @@ class Tracker:
             return
         kept, found = self.latest
         value = self.value(kept.switches, found)
-        # Three at most, and two more below: to propagate all of them over the window would take longer than the update
-        # itself.
+        # Three at most, and two more below: all of them over the window would take longer than the update itself.
         best = {b for b in self.find_best(kept, found, value) if b is not None}
         # A change can be refuted only where the modes before it fit as well as they can.
         doubted = 2.0 * (value - value.min()) < REFUTED_FROM
@@ -373,8 +372,7 @@ class Tracker:
         A, k = self.settings.entries, len(pasts)
         there = self._catch_up(there)
         kept, found, _ = there
-        # No birth that could lie before the start: all agree, and nothing is copied. This is the usual case of an
-        # update.
+        # No birth that could lie before the start: all agree, and nothing is copied, as in most updates.
         is_early = kept.times[:, 0] + found.moved[:, A] < end
         if not pasts and not kept.switches[is_early].any():
             return there
@@ -394,8 +392,7 @@ class Tracker:
         for past in pasts:
             past.absorb(found, self.birth_information)
         if k:
-            # The first k modes and times have left, the slots at the end are free; codes of sequences stay, with what
-            # has left.
+            # The first k modes and times have left, and the last slots are free; codes still count what has left.
             rolled = np.roll(kept.modes, -k, axis=1), np.roll(kept.times, -k, axis=1)
             for array in rolled:
                 array[:, -k:] = 0

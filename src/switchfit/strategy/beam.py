@@ -187,8 +187,7 @@ class Beam:
             marks = np.union1d(marks, seen[:: max(len(seen) // MOST_GRID_INTERVALS, 1)])
         mesh = build_mesh(run, self.grid, marks)
         self.times, self.stops = mesh.times, choose_stops(mesh.times, self.grid, marks)
-        # Only n/2 log(2 J / n) needs the number of values; with sigma known, scores are in units of log likelihood as
-        # they are.
+        # Only n/2 log(2 J / n) needs the number of values; with sigma known, scores are log likelihoods as they are.
         is_unknown = any(item.sigma is None for item in run.measurements)
         self.counts = count_values(run.measurements, mesh.times) if is_unknown else None
         structure, self.functions, jumps = trace_library(problem, e, library, self.births, mesh)

@@ -54,8 +54,7 @@ def look_beyond_corners(
                     continue
                 for matrix in MATRICES:
                     there = evaluator(point, matrix=matrix)
-                    # J is smooth on one path: the model about the first point on another one says how low J may be
-                    # there.
+                    # J is smooth on one path: a model about the first point on another one says how low J may be there.
                     found = minimize_quadratic(there.gradient, there.hessian, errors > 0.0, int(place), -np.inf, np.inf)
                     if found is not None:
                         break

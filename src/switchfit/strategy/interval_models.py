@@ -52,8 +52,7 @@ def list_hops(
     free = free & (unknowns.lower < theta) & (theta < unknowns.upper) & ~evaluator.problem.is_sigma
     for e, listed in enumerate(intervals):
         here = _evaluate_run(evaluator, e, theta) if listed else whole
-        # One evaluation of the whole and one of the run at theta serve all intervals of the run; each adds one of the
-        # run alone.
+        # One evaluation of the whole and one of the run at theta serve all intervals; each adds one of the run alone.
         for place, low, high in listed:
             model = partial(_find_lowest, evaluator, e, whole, here, theta, free, matrices, place, low, high)
             middle = theta.copy()
@@ -80,8 +79,7 @@ def _find_lowest(
     """
     check_time()
     own, mine = evaluator.problem.own_places[e]
-    # At the upper end of an interval J has another derivative on the side of the next sample: it has to be that from
-    # inside.
+    # At the upper end of its interval J has another derivative beyond the sample: it has to be that from inside.
     side, away = 1 if point[place] < high else -1, (theta - point)[mine]
     for matrix in matrices:
         there = _evaluate_run(evaluator, e, point, side, matrix)
@@ -92,8 +90,7 @@ def _find_lowest(
         # written about theta: J, g and H of the run are moved there by its own quadratic model, g + H away.
         cost = whole.cost - here.cost + there.cost + (there.gradient[own] + 0.5 * curvature @ away) @ away
         gradient, hessian = whole.gradient.copy(), whole.hessian.copy()
-        # Two names of a run may be one unknown of the problem: `add.at` adds both, where an indexed sum would keep the
-        # last.
+        # Two names of a run may be one unknown of the problem: an indexed sum would keep the last of them alone.
         np.add.at(gradient, mine, (there.gradient - here.gradient)[own] + curvature @ away)
         np.add.at(hessian, (mine[:, None], mine), curvature - here.hessian[own[:, None], own])
         inside = INSIDE_INTERVAL * (high - low)  # where a reset map acts, J at the end is that of the next interval

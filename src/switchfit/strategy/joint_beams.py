@@ -62,12 +62,10 @@ class Beams:
                 moved[own] = best.parameters[own]
                 if best.evidence is not None:  # what the data of the run say about shared parameters
                     mine, at = self._locate(e)
-                    # Private parameters of the run are eliminated (a Schur complement): they follow the shared ones at
-                    # their best.
+                    # Private parameters of the run are eliminated (a Schur complement): they follow the shared ones.
                     center, g, Q = best.evidence.restrict(mine)
                     self.matrices[e][np.ix_(at, at)], self.slopes[e][at] = Q, Q @ center - g
-        # What the last run has left there is its own opinion; all of them together, with the priors, say where to go
-        # on.
+        # The last run has left its own opinion there; all of them together, with the priors, say where to go on.
         moved[self.shared] = self.combine(q)[self.shared]
         return found, moved
 
@@ -84,8 +82,7 @@ class Beams:
 
     def _join(self, chosen: Sequence[Proposal], moved: FloatArray) -> Proposal:
         for own, proposal in zip(self.own, chosen, strict=True):
-            # Shared parameters of single proposals differ from run to run; q has the one value that all of them agree
-            # on.
+            # Shared parameters differ from proposal to proposal; q has the one value for all of them.
             private = np.setdiff1d(own, self.shared)
             moved[private] = proposal.parameters[private]
         sequences = tuple(proposal.sequences[0] for proposal in chosen)

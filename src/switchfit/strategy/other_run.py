@@ -40,12 +40,10 @@ def build_other_problem(estimate: JudgedFit, other: Any) -> Problem:
     for name, parameter in given.parameters.items():
         if name in estimate.parameters:
             value = estimate.parameters[name]
-            # The other problem may have bounds of its own, which the fitted value does not know: they are widened to
-            # hold it.
+            # Bounds of the other problem do not know the fitted value: they are widened to hold it.
             bounds = {"lower": np.minimum(parameter.lower, value), "upper": np.maximum(parameter.upper, value)}
             held = parameter.fixed or name in estimate.fixed
-            # The prior is in the fitted value already; counted again it would pull the prediction, and chi-square would
-            # count it.
+            # The prior is in the fitted value already: once more it would pull the prediction, and count in chi-square.
             parameter = replace(parameter, value=value, **bounds, prior=None, fixed=held)
         parameters[name] = parameter
     return replace(given, experiments=runs, parameters=parameters)
@@ -126,8 +124,7 @@ def _complete(new: Measurements, like: Measurements) -> Measurements:
             f"the Measurements of the fit have {like.values.shape[1]} channels, those of the other run "
             f"{new.values.shape[1]}."
         )
-    # What a log does not say about its sensor is that of the sensor in the fit; it is the same instrument on another
-    # day.
+    # What a log does not say about its sensor is as in the fit: the same instrument on another day.
     names = ("sigma", "observe", "names", "units")
     left_out = {name: getattr(like, name) for name in names if getattr(new, name) is None}
     if "sigma" in left_out:

@@ -70,8 +70,7 @@ def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
 def _list_moves(sequence: tuple[str, ...]) -> Iterator[tuple[int, int]]:
     """Yield a segment that may be removed, and one behind which it may be inserted without changing the sequence."""
     for i in range(len(sequence) - 2):
-        # A mode between two equal ones: without it these are one stretch, and two transitions are free for another
-        # place.
+        # Between two equal modes: without it these are one stretch, and two transitions are free for another place.
         if sequence[i] == sequence[i + 2]:
             rest = sequence[: i + 1] + sequence[i + 3 :]
             for j in range(len(rest)):

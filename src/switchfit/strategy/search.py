@@ -179,8 +179,7 @@ class Search:
             if not starts and self.best is not None and is_enough(self.problem, self.best, self.steps):
                 starts, self.rivals = find_other_minima(self.best, self.own)
             before = self.lowest
-            # The first start that leads lower is enough: the others were found beside a minimum that is not the best
-            # any more.
+            # The first start that leads lower is enough: the others were found beside a minimum that is left then.
             for start in starts:
                 if not is_late() and self.lowest == before:
                     self._try(BY_OTHER_MINIMUM, partial(fit_briefly, self.problem), make_feasible(self.problem, start))

@@ -63,8 +63,7 @@ class Rules(NamedTuple):
         ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
         begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
         follows = np.zeros((len(ends), *allowed.shape), dtype=bool)
-        # A birth after s switches leaves most - s - 1: the rows of `ends` from the last but one back. After `most` none
-        # follows.
+        # A birth after s switches leaves most - s - 1: `ends` from the last but one back. After `most` none follows.
         follows[:-1] = allowed & ends[-2::-1, None]
         return cls(np.arange(len(modes)), shortest, begins, ends[0], follows, None)
 
@@ -80,8 +79,7 @@ class Rules(NamedTuple):
         """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
         may_leave = t - kept.last >= self.least[kept.mode]
         if self.between is not None and self.between.size:
-            # A hypothesis at the last place has no switch left; the index is clipped for it, and `follows` lets none
-            # through.
+            # At the last place no switch is left: the index is clipped, and `follows` lets none through.
             earliest, latest = self.between[:, np.minimum(kept.switches, self.between.shape[1] - 1)]
             may_leave &= (earliest < t) & (t < latest)
         may_enter = t + self.shortest <= end

@@ -372,8 +372,7 @@ def _judge_validation(found: Validation) -> Verdict:
         names = tuple(name for name in found.theta_names if name not in found.kept)
         against.append(Finding("bad", Issue("own unknowns not converged", names), ("give a better guess",)))
     is_tested = np.isfinite(found.probability)
-    # Of very many samples chi-square is unlikely for a model that is right to a per cent: it must also be clearly too
-    # large.
+    # Of many samples chi-square rejects a model that is right to a per cent: it must be clearly too large as well.
     too_far = (
         is_tested and found.probability < UNLIKELY_AS_NOISE and found.chi_square > (1 + CLEARLY_OFF) * found.freedom
     )

@@ -125,8 +125,8 @@ def _remove_error(
     # A direction that moves no residual has been fitted by nothing: it takes no degree of freedom out of r.
     does = size > NEGLIGIBLE_SINGULAR_VALUE * size.max(initial=0.0)
     Q, root = left[:, does], Z @ (right[does].T / size[does])  # Z G^+ = root Q', M = I - Q Q'
-    # A root of C: half half' = C. C may be singular, as where a direction is held, with an eigenvalue below 0 by
-    # rounding.
+    # A root of C: half half' = C. Where a direction is held C is singular, and rounding may make an eigenvalue
+    # negative.
     values, vectors = np.linalg.eigh(C)
     half = vectors * np.sqrt(np.maximum(values, 0.0))
     U = X @ half

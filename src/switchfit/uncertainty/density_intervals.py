@@ -58,8 +58,7 @@ def replace_where_cost_jumps(
     found, scale, resets = intervals.copy(), fit.variance_scale, list_resets(fit)
     for own, place in zip(pieces, places.tolist(), strict=True):
         sides = [side[~np.isnan(side[:, 0])] for side in own]
-        # Without a jump between the pieces the state that jumps is not measured near by, and J behaves as for any other
-        # time.
+        # Without a jump of J the state that jumps is not measured near by: the time is like any other.
         if place in resets and any(_find_jumps(side).max() > LEAST_JUMP * scale for side in sides):
             low, high = _find_quantiles(sides, scale, level)
             # J may be lowest at the edge of what is likely, beside a sample: the estimate is never left out.

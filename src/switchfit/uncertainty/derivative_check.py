@@ -200,8 +200,7 @@ def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[flo
     # is discretised.
     paper, discrete = evaluator(theta, method="adjoint"), evaluator(theta)
     scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(discrete.hessian)), 1e-300))
-    # In scaled unknowns the curvature is about 1: a change of all by 0.1 % changes the gradient by 1e-3 |theta /
-    # scale|.
+    # In scaled unknowns the curvature is about 1: 0.1 % of all of them changes the gradient by 1e-3 |theta / scale|.
     small = 1e-3 * float(np.linalg.norm(theta / scale))
     scales = np.outer(scale, scale)
     return (

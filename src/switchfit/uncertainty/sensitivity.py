@@ -69,8 +69,7 @@ class Sensitivity:
 
     def at(self, times: FloatArray) -> Points:
         """Return the sensitivity at nodes (K,) of the mesh; at a transition, that just before it, as for a sample."""
-        # Two rows meet at a node; that which ends there has the state before a transition, which a sample at that time
-        # sees.
+        # Two rows meet at a node; that which ends there has the state before a transition, as a sample sees it.
         row = self.simulation.row_ending(np.searchsorted(self.simulation.nodes, times) - 1)
 
         def pick(before: FloatArray, after: FloatArray) -> FloatArray:

@@ -54,8 +54,7 @@ def trace_profiles(
     # Arrays without entries, of the right shapes and types: what is saved can be loaded again.
     nothing = fit.saved_pieces[:0], fit.saved_piece_places[:0]
     highest = compute_threshold(fit, max(level, HIGHEST_LEVEL))
-    # A density is needed far out: its quantiles ask for all of its mass, where an interval by a threshold needs one
-    # crossing.
+    # Quantiles of a density ask for all of its mass, farther out than the one crossing of a threshold.
     rise = max(highest, HIGHEST_RISE * fit.variance_scale)
     if np.isnan(highest) or fit.constraints or len(problem.experiments) > MOST_TRACED_RUNS:
         return nothing

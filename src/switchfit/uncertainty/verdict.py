@@ -118,8 +118,7 @@ def _list_numbers(fit: Fit, quality: Quality | None) -> Numbers:
     ended = Numbers(np.array([fit.status.successful]), fit.integration_error, lower, tried, agreeing)
     if quality is None:
         return ended
-    # An unknown without effect makes the Hessian singular too, but has a finding of its own; all others may be
-    # determined.
+    # An unknown without effect makes the Hessian singular too, but has a finding of its own.
     is_flat = fit.status is Status.SINGULAR and not list_without_effect(fit)
     found = replace(
         ended,
