@@ -81,7 +81,7 @@ class ModeFit:
 
 
 @dataclass(frozen=True, eq=False)
-class SearchRecord:
+class SavedSearch:
     """What of a search is saved, beside its best estimate; see `ModeSearch`."""
 
     modes: tuple[str, ...]
@@ -104,7 +104,7 @@ class SearchRecord:
 
 
 @dataclass(frozen=True, eq=False)
-class ModeSearch(SearchRecord, Displayed):
+class ModeSearch(SavedSearch, Displayed):
     """Result of `find_modes`. Print it for the report.
 
     Attributes
@@ -338,7 +338,7 @@ class ModeSearch(SearchRecord, Displayed):
         """
         file = as_path(path, "path")
         content: dict[str, Any] = {"format": SEARCH_FORMAT, "version": SEARCH_VERSION, "message": self.message}
-        content["search"] = to_json(self, SearchRecord)
+        content["search"] = to_json(self, SavedSearch)
         # By its name: the sentence that is an enum's value may be worded anew, and files must stay readable.
         content["search"]["ending"]["status"] = self.status.name
         content["best"] = None if self.best is None else describe_best(self.best)
@@ -380,11 +380,11 @@ class ModeSearch(SearchRecord, Displayed):
             as_instance(problem, "problem", Problem, "an sf.Problem")
         content = read_document(file, "a saved search", SEARCH_FORMAT, SEARCH_VERSION)
         try:
-            record = from_json(SearchRecord, content.get("search"), "search")
+            record = from_json(SavedSearch, content.get("search"), "search")
             best = load_best(content.get("best"))
         except (ValueError, OverflowError, RecursionError, MemoryError, AttributeError) as error:
             raise ValueError(f"{file} is damaged: {error}.") from error
-        own = {f.name: getattr(record, f.name) for f in fields(SearchRecord)}
+        own = {f.name: getattr(record, f.name) for f in fields(SavedSearch)}
         if problem is not None:
             _check_problem(record, problem, file)
             if best is not None:
@@ -395,7 +395,7 @@ class ModeSearch(SearchRecord, Displayed):
         return cls(**own, best=best, problem=problem)
 
 
-def _check_problem(record: SearchRecord, problem: Problem, path: Path) -> None:
+def _check_problem(record: SavedSearch, problem: Problem, path: Path) -> None:
     """Raise ValueError unless a search that was loaded from a file may be that of a problem."""
     # Names and horizons alone: a file has no digest of the model and its data.
     runs, modes, ends = problem.experiments, problem.system.modes, list(zip(record.starts, record.ends, strict=True))
