@@ -1,6 +1,6 @@
 """Run all benchmarks, print Markdown tables and write them to benchmarks/results: ``python -m benchmarks``.
 
-``python -m benchmarks sizes REVISION...`` measures nothing but how large the code is (`benchmarks.sizes`);
+``python -m benchmarks sizes TREE...`` counts in the code what drifts, and runs nothing (`benchmarks.sizes`);
 ``python -m benchmarks starts`` counts from which starts the right answer is found (`benchmarks.starts`);
 ``python -m benchmarks modes`` counts how often a search over mode sequences finds the truth (`benchmarks.modes`);
 ``python -m benchmarks sharp`` fits models with corners, beside SciPy (`benchmarks.sharp`);
