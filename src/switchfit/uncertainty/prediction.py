@@ -30,7 +30,6 @@ from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
 from switchfit.fit.comparison import find_delay
-from switchfit.fit.result import Fit
 from switchfit.fit.simulation import read_times
 from switchfit.meshes.refinement import refine_mesh
 from switchfit.problem.experiment import show_time
@@ -42,6 +41,7 @@ from switchfit.problem.validation.messages import unit_suffix
 from switchfit.problem.validation.objects import as_instance
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import Figure, draw_figure, format_html, format_line, join_first
+from switchfit.uncertainty.judged_fit import JudgedFit
 from switchfit.uncertainty.sensitivity import Points, compute_sensitivity
 
 
@@ -196,7 +196,7 @@ def _build_band(values: FloatArray, half: FloatArray) -> FloatArray:
     return np.stack([values - half, values + half], axis=-1)
 
 
-def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
+def predict(estimate: JudgedFit, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
     """Return states and outputs at any times with their standard errors and bands.
 
     Times are those of the states: a sensor with a delay shows the output of time t at t + delay, where figures draw it.
@@ -244,12 +244,12 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
            [ 0.8,  1.6],
            [-0. ,  0.8]])
     """
-    fit = as_instance(estimate, "estimate", Fit, "what sf.estimate returns: fit the problem first")
-    evaluator = estimate.evaluator_at_solution()
+    fit = as_instance(estimate, "estimate", JudgedFit, "what sf.estimate returns: fit the problem first")
+    evaluator = fit.evaluator_at_solution()
     problem: Problem = evaluator.problem
     experiment = as_index(experiment, "experiment", len(problem.experiments))
     if times is None:
-        points = estimate.sensitivities[experiment].nodes
+        points = fit.sensitivities[experiment].nodes
     else:
         asked = _check_times(times, problem, experiment)
         # Times beyond the mesh need another one; those inside are put in as nodes, so that nothing is interpolated.
@@ -258,7 +258,7 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
         else:
             mesh = evaluator.meshes[experiment].insert(asked)
             points = compute_sensitivity(problem, experiment, fit.theta, mesh).at(asked)
-    return build_prediction(estimate, problem, experiment, points)
+    return build_prediction(fit, problem, experiment, points)
 
 
 def build_prediction(fit: Any, problem: Problem, e: int, points: Points) -> Prediction:
