@@ -35,7 +35,7 @@ MICROSECONDS_PER_DAY = 86_400_000_000
 EPOCH = date(1970, 1, 1)
 
 Sentence: TypeAlias = Any
-"""A sentence as `pynmea2` parses it, with an attribute for each of its fields."""
+"""A sentence as pynmea2 parses it, with an attribute for each of its fields."""
 
 _CHANNELS = {
     "GGA": {"altitude": "altitude", "quality": "gps_qual", "satellites": "num_sats", "hdop": "horizontal_dil"},

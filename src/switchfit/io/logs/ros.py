@@ -33,10 +33,10 @@ Record = dict[str, float]
 """The channels of one message."""
 
 Message: TypeAlias = Any
-"""A message as `rosbags` deserializes it, with an attribute for each field of its type."""
+"""A message as rosbags deserializes it, with an attribute for each field of its type."""
 
 Connection: TypeAlias = Any
-"""Where the messages of one topic and type stand in a bag; `rosbags` has a class of its own for each kind of bag."""
+"""Where the messages of one topic and type stand in a bag; rosbags has a class of its own for each kind of bag."""
 
 _POSE = ("x", "y", "z", "", "", "yaw")
 

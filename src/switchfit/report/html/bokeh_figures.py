@@ -21,7 +21,7 @@ from switchfit.report.plane import find_plane
 from switchfit.report.times import Timed, describe_clock, label_time
 
 Plot: TypeAlias = Any
-"""A `bokeh.plotting.figure`. Bokeh's annotations know neither the tags of what is drawn, nor that an axis has the kinds
+"""A figure of Bokeh. Bokeh's annotations know neither the tags of what is drawn, nor that an axis has the kinds
 of label and ticker that it is given here."""
 
 Renderer: TypeAlias = Any
