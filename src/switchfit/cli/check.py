@@ -63,6 +63,7 @@ def _check_files(problem: Path, full: bool) -> None:
     """Print the parts of a problem that are known without running a Python file."""
     from switchfit.io.problem_file.loading import read_experiments
 
+    # The same steps as of a whole problem, up to the model: logs are read and cut, units and horizons are known.
     runs = read_experiments(problem)
     from switchfit.report.problem import write_experiments
 

@@ -49,6 +49,7 @@ def examples(name: ExampleName = None, folder: ExampleFolder = None) -> None:
     if name not in found:
         errors.fail(f"there is no example {name!r}; there are {', '.join(found)}.")
     target = Path(name) if folder is None else folder
+    # Before anything is written.
     refuse_existing(target, "FOLDER")
     source = found[name]
     if source.is_dir():
@@ -74,6 +75,7 @@ def _describe(path: Path) -> str:
     readme = path / "README.md"
     if readme.is_file():
         return readme.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+    # An example without a README says what it is about in the first line of its script.
     script = path if path.is_file() else next(iter(sorted(path.glob("*.py"))), None)
     text = "" if script is None else ast.get_docstring(ast.parse(script.read_text(encoding="utf-8"))) or ""
     return text.partition("\n")[0]

@@ -48,6 +48,7 @@ def design(
     terminal.print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
     table = loaded.contents.design
     settings = {} if table is None else table.model_dump(exclude_none=True)
+    # What is asked for on the command line wins over [design] of the file.
     settings |= options.select_given(criterion=criterion, samples=samples)
     plan = sf.design(loaded.problem, **settings)
     files.show(plan, summarize_design(plan), out, "design", figures, saved=True)

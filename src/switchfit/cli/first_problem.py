@@ -58,6 +58,7 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
         channels, others = choose_channels(read)
         # A folder of a ROS bag, and a large log, are referred to where they are.
         copied = [log] if log.is_file() and log.stat().st_size <= LARGEST_COPY else []
+        # Relative to the new folder, so that both may be moved together.
         named = log.name if copied else Path(os.path.relpath(log, folder)).as_posix()
         texts["problem.toml"] = write_problem(read, channels, others, named)
         texts["model.py"] = _fill_template(
@@ -67,6 +68,7 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
             names=tuple(channels),
             units=tuple(read.units.get(name, "") for name in channels),
         )
+    # All texts are complete before the first file is written: a log that cannot be used leaves no folder behind.
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
@@ -195,6 +197,7 @@ def _describe_data(
     if others:
         yield f"# further channels: {', '.join(others)}"
     yield from (f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues)
+    # What the file needs to be read at all; the log itself was read without repair, and says why above.
     repairs = ["sort"] if np.any(np.diff(log.times) < 0) else []
     repairs += ["drop-duplicates"] if len(np.unique(log.times)) < len(log) else []
     if repairs:

@@ -87,10 +87,12 @@ def fit(
     """
     # What is not given stays as the file has it.
     overrides = options_module.select_given(strategy=strategy, hessian=hessian, max_iterations=max_iterations)
+    # Without a folder there is nowhere to write them: matplotlib is then not even imported.
     drawn = "" if out is None or no_figures else figures
     output = Output(out, figures=drawn, certificate=certificate, full=full)
     if model is not None:
         raise typer.Exit(_fit_logs(problem, model, overrides, output, table))
+    # Several files without --problem are most likely logs whose problem file was forgotten.
     if len(problem) != 1 or table is not None:
         errors.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
     loaded = _override(files.load(problem[0], out), overrides)
@@ -158,6 +160,7 @@ def write_estimate(estimate: Estimate, loaded: ProblemFile, output: Output, *, s
     write_atomically(report + "\n", folder / "report.txt")
     for name, table in list_tables(estimate).items():
         write_atomically(table, folder / f"{name}.csv")
+    # With the options as they were overridden: the same call can be made again.
     provenance = estimate.describe_provenance(replace(loaded.provenance, options=loaded.options))
     _save(estimate, folder / "estimate.json", provenance, complete=output.certificate)
     if output.figures:
@@ -178,6 +181,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
     rows: list[dict[str, Any]] = []
     fitted = []
     for name, path in logs:
+        # A folder for each log, by the name that tells it from the others.
         folder = None if output.folder is None else output.folder / name
         estimate, error = None, ""
         try:

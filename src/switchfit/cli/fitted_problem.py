@@ -74,6 +74,7 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
 def _describe_run(estimate: Estimate, e: int, run: Experiment) -> dict[str, Any]:
     """Return the keys of an experiment that a search has found, and its origin: times are then numbers."""
     found = {"mode_sequence": list(run.mode_sequence), "transition_times": estimate.transition_times[e].tolist()}
+    # Times of the fit are numbers since the origin, which the file may have left to the data.
     if run.origin is not None:
         found["origin"] = run.origin.date
         if run.time_zone is not None:

@@ -92,6 +92,7 @@ def describe_fit(log: str, estimate: Estimate | None, error: str) -> dict[str, A
     for unknown in unknowns:
         shown = numbers_module.label_quantity(unknown["unknown"], unknown["unit"])
         row |= {shown: unknown["value"], ERROR.format(shown): unknown["std_error"]}
+    # Dates last, so that the columns of numbers are the same for logs with and without them.
     row |= {f"{unknown['unknown']} (date)": unknown["date"] for unknown in unknowns if unknown.get("date")}
     return {**row, "message": message}
 
@@ -120,9 +121,11 @@ def write_logs(rows: Sequence[Mapping[str, Any]], path: Path) -> str | bytes:
     path : Path
         Its ending says whether it is Parquet or CSV.
     """
+    # Rows differ: a log that was refused has no unknowns, and modes that collapse have none either.
     columns = sorted(list_columns(rows), key=lambda name: name == "message")  # which comes last
     if path.suffix.lower() not in PARQUET:
         return write_rows(rows, columns)
+    # Whether it is installed was checked before the first fit.
     import pyarrow.parquet
 
     table, file = pyarrow.table({name: [row.get(name) for row in rows] for name in columns}), io.BytesIO()

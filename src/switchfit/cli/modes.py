@@ -90,6 +90,7 @@ def _write_best(search: ModeSearch, loaded: ProblemFile, folder: Path) -> Path |
         return None
     try:
         text = write_fitted_problem(loaded, search.best, folder)
+    # A problem that is built in Python has no file that could be changed: the search itself is complete.
     except InputError as error:
         terminal.print_note(f"no best.toml: {error}")
         return None

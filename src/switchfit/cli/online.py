@@ -104,6 +104,7 @@ def online(
     sensors = loaded.problem.experiments[0].measurements
     # Nodes as well as samples need room, and between samples there may be nodes of the mesh.
     room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
+    # Options override the table [online] of the file.
     settings = loaded.contents.online.model_dump(exclude_none=True) | options.select_given(window=window)
     settings |= {"max_switches": max_switches, "budget": budget, "capacity": room}
     library = build_library(loaded.problem, **loaded.library)  # modes that it leaves out never follow
@@ -134,6 +135,7 @@ def _start(
 ) -> OnlineEstimator:
     """Return the estimator: a new one, or that of a state and a journal."""
     if state is not None and state.exists():
+        # Thresholds are those of the saved state; --threshold and --false-alarms are for a new one.
         estimator = sf.OnlineEstimator.load(state, loaded.problem, **settings)
     else:
         estimator = sf.OnlineEstimator(loaded.problem, **settings, **alarms)
@@ -167,6 +169,7 @@ def _run(
         logged = list_updates([(item.times, item.values) for item in run.data])
         samples: Iterable[Any] = _read_lines(stopped) if stdin else ((t, y, None) for t, y in logged if t > last)
         for number, sample in enumerate(samples, start=1):
+            # An empty line, as a terminal or a pipe that is kept alive sends it.
             if stdin and not sample.strip():
                 continue
             try:
@@ -180,6 +183,7 @@ def _run(
                 terminal.print_error(f"line {number}: {error}")
                 refused += 1
                 continue
+            # One line for each sample, printed at once: a reader at the other end of a pipe acts on it.
             line = terminal.format_json(summarize_now(now, run))
             if page is not None:
                 page.show(line)
@@ -203,6 +207,7 @@ def _read_lines(stopped: Callable[[], bool]) -> Iterator[bytes]:
         except interrupts.CtrlC:
             signal.raise_signal(signal.SIGINT)  # for the handler that makes `stopped` true
             return
+        # The end of the stream; an empty line still has its newline.
         if not line:
             return
         yield line

@@ -26,6 +26,7 @@ def paper(out: PaperFolder = Path("paper"), quick: Quick = False, only: Part = N
     Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run resumes when
     the same command is run again.
     """
+    # Before anything imports matplotlib: a backend with windows fails on a machine without a display.
     os.environ.setdefault("MPLBACKEND", "Agg")
     from switchfit.paper.runner import TABLE_FILE as TABLE
     from switchfit.paper.runner import run

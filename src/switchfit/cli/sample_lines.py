@@ -33,6 +33,7 @@ def read_sample(line: bytes, run: Experiment) -> tuple[Any, Any, Any]:
     """
     try:
         given = json.loads(line)
+    # Also text in no encoding, and lists in lists without end: a stream may send anything.
     except (ValueError, RecursionError):
         given = None
     if not isinstance(given, dict) or "t" not in given or not set(given) <= {"t", "y", "u"}:

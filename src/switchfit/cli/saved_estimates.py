@@ -39,6 +39,7 @@ def _rebuild_problem(
     """
     if given is None:
         raise InputError(f"{path} does not say what it was made from: fit its problem file again.")
+    # Functions cannot be saved: without a problem file there is no way back to the model.
     if not given.problem_file:
         raise InputError(
             f"{path} does not have its problem, which was built in Python: functions are not saved, only hashes of the "
@@ -129,6 +130,7 @@ def list_changed_models(given: Provenance | None, loaded: ProblemFile) -> list[s
     """
     if given is None:
         return []
+    # By their hashes, of Python files alone: the data are compared by value.
     before, now = (
         {digest.name: digest.sha256 for digest in each.files if digest.name.endswith(".py")}
         for each in (given, loaded.provenance)

@@ -29,6 +29,7 @@ def simulate(problem: options.ProblemPath, out: OutputFile, times: Times = "") -
     loaded = files.load(problem)
     from switchfit.cli.trajectory_table import choose_times, write_trajectories
 
+    # Checked for all experiments before the first one is integrated.
     given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
     runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
     table = write_trajectories(loaded.problem.run_names, runs)

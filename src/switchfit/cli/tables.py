@@ -66,6 +66,7 @@ def write_runs(estimate: Estimate) -> str:
             "time unit": trajectory.time_unit,
             "values": sum(channel.count for channel in here),
             "chi2": sum(channel.chi_square for channel in here) if here else np.nan,
+            # Of the channel that is explained worst, as in the report: a mean would hide it.
             "explained": min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan),
         }
         if trajectory.origin is not None:
@@ -110,5 +111,6 @@ def list_tables(estimate: Estimate) -> dict[str, str]:
     ----------
     estimate : Estimate
     """
+    # Only what the report leaves out: a fit of one run has no tables.
     runs = {"runs": write_runs(estimate)} if len(estimate.run_names) > SCREEN["experiments"] else {}
     return runs | ({"unknowns": write_unknowns(estimate)} if len(estimate.theta) > SCREEN["unknowns"] else {})

@@ -56,6 +56,7 @@ def _print(text: object, *, err: bool = False) -> None:
         typer.echo(text, err=err)
     except BrokenPipeError:
         stream = sys.stderr if err else sys.stdout
+        # As the documentation of Python recommends: without it, the flush at exit fails again, with a traceback.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())  # buffered text is flushed there, at the latest when Python exits
         os.close(nowhere)

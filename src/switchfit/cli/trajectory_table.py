@@ -36,6 +36,7 @@ def choose_times(given: str, experiment: Experiment) -> FloatArray | Literal["sa
     # tf may be estimated: then the grid ends at its guess.
     t0, tf = experiment.ends_of_modes(experiment.initial_times)[[0, -1]].tolist()
     step = np.nan
+    # What is no number stays NaN, which no comparison below accepts.
     with contextlib.suppress(ValueError):
         step = float(given)
     if not (0 < step < np.inf and (tf - t0) / step < MOST_SIMULATED_TIMES):

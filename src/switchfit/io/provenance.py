@@ -28,8 +28,8 @@ def find_version(package: str) -> str:
         return "not installed as a package"
 
 
-def find_versions() -> dict[str, str]:
-    """Return the versions of Python and of `PACKAGES`."""
+def _find_versions() -> dict[str, str]:
+    """Return the versions of Python and of `RECORDED_PACKAGES`."""
     return {"Python": platform.python_version(), **{package: find_version(package) for package in RECORDED_PACKAGES}}
 
 
@@ -83,7 +83,7 @@ class Provenance:
     log: str = ""
     options: Mapping[str, int | float | str] = field(default_factory=dict)
     files: tuple[FileDigest, ...] = ()
-    versions: Mapping[str, str] = field(default_factory=find_versions)
+    versions: Mapping[str, str] = field(default_factory=_find_versions)
     platform: str = field(default_factory=lambda: f"{platform.platform()}, {platform.machine()}")
 
 
@@ -96,6 +96,7 @@ def make_relative(path: str | Path, folder: str | Path) -> str:
     """
     whole = os.path.abspath(path)
     try:
+        # Forward slashes on all systems: a folder that is moved to another machine is found there, too.
         return Path(os.path.relpath(whole, os.path.abspath(folder))).as_posix()
     except ValueError:
         return Path(whole).as_posix()

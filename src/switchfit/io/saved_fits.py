@@ -65,6 +65,7 @@ def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provena
     """
     content = write_fit(fit, certificate)
     if provenance is not None:
+        # From the folder of the file that is written: both may be moved together. An empty one stays empty.
         folder = provenance.folder and make_relative(provenance.folder, path.resolve().parent)
         content["provenance"] = to_json(replace(provenance, folder=folder), Provenance)
     write_document(content, Path(path))
@@ -78,6 +79,7 @@ def write_fit(fit: Fit, certificate: Certificate) -> dict[str, Any]:
     fit : Fit
     certificate : Certificate
     """
+    # As it will be judged when it is loaded.
     verdict = judge(fit, certificate)
     fields = to_json(fit, Fit)
     sealed = {"fit": {name: fields[name] for name in FIT_FIELDS}, "certificate": to_json(certificate, Certificate)}
@@ -92,6 +94,8 @@ def write_fit(fit: Fit, certificate: Certificate) -> dict[str, Any]:
 
 def _compute_seal(content: Mapping[str, Any]) -> str:
     """Return a digest of the fit and the certificate in the content of a file, whatever its layout."""
+    # Parsed and written again with sorted keys: spaces and the order of keys do not count, every digit of a number
+    # does.
     sealed = [content.get("fit"), content.get("certificate")]
     return hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()
 
@@ -135,6 +139,7 @@ def load_fit(path: str | Path, problem: Problem | None = None) -> tuple[Fit, Cer
     try:
         fit, certificate = parse_fit(content)
         provenance = from_json(Provenance | None, content.get("provenance"), "provenance")
+    # What a file of arbitrary JSON can raise: nested without end, numbers beyond int64, lengths that no memory holds.
     except (ValueError, OverflowError, RecursionError, MemoryError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
     if provenance is not None and provenance.folder:
@@ -154,6 +159,7 @@ def _check_problem(fit: Fit, problem: Problem, path: str | Path) -> None:
             f"{', '.join(problem.theta_names)}: it is the fit of another problem."
         )
     runs = fit.trajectories, problem.experiments
+    # By the instant, not by the text of the date: zones may be named in several ways.
     clocks = [[(run.time_unit, run.origin and run.origin.instant) for run in each] for each in runs]
     if clocks[0] != clocks[1]:
         saved, given = (", ".join(map(_describe_clock, each)) for each in runs)

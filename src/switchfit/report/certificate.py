@@ -96,6 +96,7 @@ def write_orders(check: DerivativeCheck) -> str:
     check : DerivativeCheck
     """
     verdict = f"FAILED: {'; '.join(map(str, check.failures))}" if check.failures else "passed"
+    # Without remainders there are no orders, and nothing that was expected of them.
     if any(issue.kind == "cost not finite" for issue in check.failures):
         return f"No orders were observed: {verdict}."
     observed = check.observed_orders

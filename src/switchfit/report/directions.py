@@ -66,6 +66,7 @@ def write_direction(found: Identifiability, direction: Direction) -> str:
     # Only the unknowns that matter for the direction, which its names are; its vector has all of them.
     places = [found.theta_names.index(name) for name in direction.names]
     moves = join_words([_format_move(found, i, side * float(direction.change[i])) for i in places])
+    # What is little depends on what is known: of the noise, of J, or of how the data vary.
     rise = _RISES[found.meaning].format(f"{found.rise:.2g}") if found.rise > 0 else ""
     seen = f", or the opposite, should raise J little; {rise}."
     seen = _format_rises(direction, rise, found.cost) if found.tried else seen
@@ -81,6 +82,7 @@ def _format_move(found: Identifiability, i: int, change: float) -> str:
 
 def _format_rises(direction: Direction, rise: str, cost: float) -> str:
     """Return the rise of J on both sides of a change, as the end of a sentence."""
+    # A side is NaN where constraints leave no room, or J could not be evaluated.
     finite = [r for r in direction.rises if np.isfinite(r)]
     if not finite:
         return ": J could not be evaluated there."

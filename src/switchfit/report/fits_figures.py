@@ -120,6 +120,7 @@ def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bo
     values = study.theta[study.success, k]
     # A fit that ended in another minimum would make all others one bar.
     low, high = np.percentile(values, [0.5, 99.5])
+    # Estimates that are all equal, as of a parameter at its bound, still need an axis with a width.
     margin = 0.25 * max(float(high - low), 1e-12 * abs(centre), np.finfo(float).tiny)
     limits, label = (low - margin, high + margin), f"{len(values)} estimates"
     ax.hist(values, bins=40, range=limits, density=density, color=SHADE_COLOUR, alpha=0.7, label=label)
@@ -147,6 +148,7 @@ def plot_starts(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
     ax : matplotlib.axes.Axes, optional
     """
     drawn, ax = style.open_axes(ax, (7.0, 3.6))
+    # Starts that failed come last.
     order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
     costs, labels, rank = study.cost[order], study.clusters[order], np.arange(1, len(order) + 1)
     floor = max(1e-12 * abs(costs[0]), 1e-300)  # differences below are rounding

@@ -78,6 +78,7 @@ def tabulate_study(fits: Fits) -> tuple[Table, str]:
     fits : Fits
     """
     listed, notes = range(len(fits)), []
+    # Few fits are listed as they were given, so that one finds one's own; of many, those that need a look.
     if len(fits) > LISTED_FITS:
         listed = fits.worst_first[:LISTED_WORST].tolist()
         notes.append(f"the worst {LISTED_WORST} of {len(fits)} fits; .to_pandas() has all of them")
@@ -126,6 +127,7 @@ def tabulate_monte_carlo(study: MonteCarlo) -> tuple[Table, str]:
     count = int(study.success.sum())
     if count < 2:
         return Table([], ""), TOO_FEW
+    # What an estimator is judged by: its bias against the error of that bias, its spread against the reported error.
     spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
     # The middle of the standard errors that the fits report, to be compared with the spread of their estimates.
     reported = np.median(study.standard_errors[study.success], axis=0)

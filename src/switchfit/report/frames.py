@@ -124,6 +124,7 @@ def _describe_residuals(estimate: Estimate) -> Frame:
         parts.append(part)
     names = list(parts[0]) if parts else []
     columns = _list_columns({name: np.concatenate([part[name] for part in parts]) for name in names})
+    # Run, channel and time tell a row from all others.
     index = tuple(c._replace(unit=_get_time_unit(estimate)) if c.name == "time" else c for c in columns[:3])
     return Frame(index, columns[3:])
 
@@ -217,6 +218,7 @@ def describe_fits(fits: Fits) -> Frame:
         columns += _split(values, fits.theta_names, fits.theta_units, label)
     names = ("cost", "explained", "samples", "optimality", "iterations", "evaluations", "collapsed", "at_bounds")
     columns += [Column(name, getattr(fits, name)) for name in (*names, "message")]
+    # What is true of the study as a whole; `requested` is more than the rows where it was stopped.
     attributes: dict[str, str | float] = {"requested": fits.requested, "seconds": float(fits.seconds)}
     if isinstance(fits, Bootstrap):
         attributes["resample"] = fits.resample

@@ -84,6 +84,7 @@ def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatA
     ax : matplotlib.axes.Axes
     """
     colours = style.assign_colours(modes, LINE_COLOURS)
+    # A library may have dozens of modes, most of which are never probable.
     drawn = [mode for mode, own in zip(modes, probability.max(axis=0), strict=True) if own > INVISIBLE]
     rows = [probability[:, modes.index(mode)] for mode in drawn]
     ax.stackplot(t, rows, labels=drawn, colors=[colours[mode] for mode in drawn], step="post", linewidth=0)

@@ -119,6 +119,7 @@ def _tabulate_numbers(search: ModeSearch) -> list[str]:
 def _list_alternatives(search: ModeSearch) -> list[str]:
     """Return a line for each alternative: its weight, its criterion less the lowest, and its sequence."""
     criteria = list_criteria(search)
+    # The criterion by which the alternatives were weighed: weights are exp(-difference / 2).
     name = "criterion" if "criterion" in criteria else "aicc" if search.criterion == "aicc" else "mbic"
     lowest = getattr(search.chosen[0], name)
     chosen = search.chosen[:LISTED]

@@ -35,6 +35,7 @@ def fit_legend(labels: list[str], inches: float, most: int, fontsize: str | floa
     fontsize : str or float
     """
     size = FontProperties(size=fontsize).get_size_in_points()
+    # An estimate: the exact width is known only after drawing.
     widest = size * (HANDLE + LETTER * max(map(len, labels), default=0))
     return {"fontsize": size, "ncols": min(most, max(int(72 * inches / widest), 1)), "frameon": False}
 

@@ -21,6 +21,7 @@ def format_rounded(value: float, error: float) -> tuple[str, str, str]:
     value, error : float
         An error that is NaN is left away; one of 0 says that the value is held.
     """
+    # Without an error there is nothing to round to: eight digits, and "held" where the error is known to be 0.
     if not np.isfinite(error) or error <= 0.0 or not np.isfinite(value):
         return f"{value:.8g}", "held" if error == 0.0 else "", ""
     last = 1 - _find_exponent(error)  # decimal place of the second digit of the error

@@ -42,6 +42,7 @@ def write_log(log: OnlineLog) -> str:
     """
     unit = times_module.suffix_time(log)
     now, end = log.now, format_time(log.now.time, log)
+    # Without a change since the start there is no transition whose time could be uncertain.
     error = now.time_errors[-1] if len(now.time_errors) else np.nan
     since = format_estimate(now.since, float(error), log)[0]
     changes = format_count(len(now.transition_times), "change")

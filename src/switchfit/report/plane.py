@@ -33,6 +33,7 @@ def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | 
     """
     parts = [re.findall(r"[^\W\d_]+", name.lower()) for name in names]
     for k, one in enumerate(parts):
+        # East before north: the first of a pair is the horizontal axis, whatever the order of the channels.
         for pair in PAIRS if units[k] in LENGTH_UNITS and not NO_POSITIONS & set(one) else ():
             # The partner's name has y where this one has x, as a part: pos_x and pos_y, but not max and may.
             other = [pair.get(part, part) for part in one]

@@ -125,6 +125,7 @@ def write_steps(evaluator: Evaluator, *, full: bool = False) -> str:
     """
     rows, names = [], evaluator.problem.run_names
     for name, structure, mesh in zip(names, evaluator.structures, evaluator.meshes, strict=True):
+        # Modes that are stiff get implicit steps; if all are, or none, one word is enough.
         implicit = " and ".join(map(repr, structure.list_implicit_modes()))
         kind = "implicit steps" if structure.has_one_method else f"steps, implicit ones in {implicit}, else explicit"
         kind = kind if implicit else "explicit steps"

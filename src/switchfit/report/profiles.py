@@ -44,10 +44,12 @@ def write_profile(profile: Profile) -> str:
     run, unit, percent = _find_run(profile), unit_suffix(profile.unit), f"{100 * profile.level:.3g} %"
     value, error = times.format_estimate(profile.value, profile.standard_error, run)
     low, high = profile.interval()
+    # With sigma estimated as well, the ratio follows F; the threshold is its quantile.
     law = "chi-square with 1 degree of freedom"
     law = law if profile.fit.sigma_known else f"F with 1 and {profile.fit.freedom} degrees of freedom"
     quadratic = profile.fit.confidence_intervals(profile.level)[profile.fit.theta_names.index(profile.name)]
     both = ((low, high), quadratic)
+    # Both intervals to the same places, by the width of the exact one, so that they can be compared.
     exact, other = (", ".join(format_time(end, run, (high - low) / 4) for end in ends) for ends in both)
     end_unit = unit if run is None else ""
     lines = [

@@ -109,6 +109,7 @@ def write_undefined(issue: Issue) -> str:
     role, operation, line, run = issue.subjects
     x = [float(f"{value:.6g}") for value in list_figures(issue, "x")]
     t = f"t = {get_figure(issue, 't'):.6g}, " if "t" in issue.figures else ""
+    # The value is fine where only the derivative is not, as of sqrt at 0.
     lacks = "derivatives" if get_figure(issue, "valued") else "value"
     function = f"{role}{f' of {run}' if run else ''} has no finite {lacks}{f' at {t}x = {x}' if x else ''}"
     # Order 0 is the function itself, 1 and 2 are its derivatives, which are needed for gradient and Hessian.

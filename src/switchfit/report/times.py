@@ -70,6 +70,7 @@ def format_time(time: float, run: Timed | None, error: float = np.nan, *, digits
     if run is None or date is None:
         return f"{time:.{digits}g}"
     unit = SECONDS_OF_UNIT[normalize_time_unit(run.time_unit)]
+    # A date to the place that its error allows; a known one as short as it can be written.
     if np.isfinite(error) and error > 0:
         return format_date(date, error * unit)
     return format_date(date, LEAST_ERROR_IN_LAST_PLACES * unit / 1000, short=True)
@@ -201,6 +202,7 @@ def list_jumps(times: FloatArray, run: Timed) -> str:
         Of which they are: dates if its times are dates.
     """
     shown = [format_time(time, run) for time in times.tolist()]
+    # Doses of weeks: the first ones show the pattern, the last one the end.
     if len(shown) > MOST_JUMPS:
         shown = [*shown[: MOST_JUMPS - 2], "...", shown[-1]]
     return f"{format_count(len(times), 'jump')} at {', '.join(shown)}{suffix_time(run)}" if shown else ""

@@ -96,6 +96,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     table = Table(rows, "<><><>><><", titles)
     if not known or corrected:
         return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent." if known else ""
+    # A robust loss is not the log-likelihood of any noise that is known: standard errors take it for one.
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
     has_sandwich = isinstance(fit, Estimate) and fit.has_sandwich
     other = ": covariance_from('sandwich') does not." if has_sandwich else "."
@@ -131,6 +132,7 @@ def select_unknowns_of_fit(fit: Fit, most: int) -> list[int]:
     fit : Fit
     most : int
     """
+    # What is held is what a reader has to see, however many unknowns there are.
     marked = [i for i, name in enumerate(fit.theta_names) if _mark_unknown(fit, name)]
     return selection.select_unknowns(fit.is_time.tolist(), most, marked)
 

@@ -119,6 +119,7 @@ def write_step(step: Issue) -> str:
     ----------
     step : Issue
     """
+    # The remedy depends on the operation, so that no fixed sentence will do.
     if step.kind == "next: define it there":
         return suggest_definition(step.subjects[1])
     kind = step.kind.removeprefix("next: ")
@@ -152,6 +153,7 @@ def _write_wrong_model(issue: Issue) -> str:
     left, errors = f"is {size:.2g} sigma", ""
     if get_figure(issue, "correlated"):
         left, errors = "is correlated", f" (standard errors too small by a factor of {widening:.2g})"
+    # Where other starts disagree, the fit may be in the wrong minimum of a right model.
     wrong = "the minimum or the model is wrong" if get_figure(issue, "agrees") == 0 else "the model is wrong"
     if get_figure(issue, "explained") >= NEARLY_ALL:
         wrong = "the model is slightly wrong"

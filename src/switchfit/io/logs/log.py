@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
-from typing import Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -18,6 +18,9 @@ from switchfit.runtime.errors import InputError
 from switchfit.runtime.frames import Column, Frame, build_pandas
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_line, join_first
+
+if TYPE_CHECKING:
+    import pandas
 
 
 class Event(NamedTuple):
@@ -209,7 +212,7 @@ class Log:
             return self.labels[name]
         raise InputError(f"{self.source} has no column {shorten(name)}; its columns are {join_names(self.values)}.")
 
-    def to_pandas(self) -> Any:
+    def to_pandas(self) -> pandas.DataFrame:
         """Return a pandas DataFrame with the times as its index, and the units in ``attrs["units"]``.
 
         See Also

@@ -80,6 +80,7 @@ def list_places(estimate: Estimate, e: int) -> list[int]:
     if estimate.problem is None:
         return []
     run, places = estimate.problem.experiments[e], estimate.problem.places[e]
+    # By the name in the problem; a delay that is a number is no unknown, and in no name of theta.
     delays = [run.parameter_map.get(item.delay, item.delay) for item in run.measurements]
     return [place for place in sorted(set(places[places >= 0].tolist())) if estimate.theta_names[place] not in delays]
 

@@ -97,6 +97,7 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
 
 def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the runs that are shown, the one that is explained worst first, and the JSON of their figures."""
+    # The worst explained first: of many runs, those are in the page that deserve a look.
     order = rank_runs(estimate)[:MOST_RUNS_IN_PAGE]
     places = {e: list_places(estimate, e)[:MOST_SLIDERS] for e in order}
     points = choose_points(estimate, order, max((len(own) for own in places.values()), default=0))
@@ -117,6 +118,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
         if template not in templates:
             templates[template] = json_item(draw_run(own, sources, run=run))
         first, last = float(run.times[0]), float(run.times[-1])
+        # So that transitions at the very ends are not on the frame.
         margin = HORIZON_MARGIN * (last - first)
         written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
         ranges = {"times": {"start": first - margin, "end": last + margin}}
