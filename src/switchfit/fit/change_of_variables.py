@@ -26,12 +26,14 @@ from switchfit.problem.variables import Variables
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")  # a point whose derivatives are not finite is refused
 def convert_to_variables(variables: Variables, theta: FloatArray, here: Any, multipliers: FloatArray | None) -> Any:
     """Convert an evaluation at theta, of constraints too if there are multipliers, to the optimizer's variables."""
+    # D = dtheta/dz and E = d2theta/dz2, each for itself: J_zz = D J'' D + diag(E J').
     D, E = variables.slopes(theta)
     if isinstance(here.hessian, Arrow):
         hessian = here.hessian.scale(1.0 / D).plus_diagonal(E * here.gradient)
         return replace(here, gradient=D * here.gradient, hessian=hessian)
     if multipliers is None:
         return Evaluation(here.cost, *variables.derivatives_inward(theta, here.gradient, here.hessian))
+    # The second derivative of theta(z) multiplies the slope of the Lagrangian, whose Hessian this is.
     slope = here.gradient + multipliers @ here.jacobian
     hessian = variables.derivatives_inward(theta, slope, here.hessian)[1]
     return replace(here, gradient=D * here.gradient, hessian=hessian, jacobian=here.jacobian * D)
@@ -69,6 +71,7 @@ class ChangeOfVariables(NamedTuple):
         points, nodes = evaluator.breakpoints(), {}
         for i in np.flatnonzero(log_times).tolist():
             away = points[i] - variables.origin[i]
+            # Nodes that are nearer to each other than their logarithms tell are one breakpoint, that of the first.
             logs, first = np.unique(np.log(away[away > 0]), return_index=True)
             points[i], nodes[i] = logs, (logs, points[i][away > 0][first])
         joined = (constraints.A != 0) & log_times
@@ -80,6 +83,8 @@ class ChangeOfVariables(NamedTuple):
         theta = np.asarray(np.clip(self.variables.outward(z), self.constraints.lower, self.constraints.upper))
         for i, (logs, nodes) in self.nodes.items():
             k = int(np.searchsorted(logs, z[i]))
+            # Bit for bit: a transition beside its node by the rounding of exp would take the other one-sided
+            # derivative.
             if k < len(nodes) and logs[k] == z[i]:
                 theta[i] = nodes[k]
         return theta

@@ -46,17 +46,20 @@ def idle_unknowns(evaluator: Evaluator, theta: FloatArray, parameters: bool) -> 
     problem = evaluator.problem
     idle = np.zeros(len(theta), dtype=bool)
     ends = zip(problem.experiments, problem.ends_of_modes(theta), strict=True)
+    # Equal times differ by rounding of the clock, which is large where times are dates.
     collapsed = [times[1:] - times[:-1] <= ROUNDING_OF_TIMES * run.clock for run, times in ends]
     if not any(map(np.any, collapsed)):  # the usual case: tested at every step
         return idle
     for run, where, own in zip(problem.experiments, problem.unknowns.times, collapsed, strict=True):
         for first, after in np.flatnonzero(np.diff(own, prepend=False, append=False)).reshape(-1, 2).tolist():
+            # The transitions around the collapsed modes: moved together, between equal modes, they change nothing.
             group = where[max(first - 1, 0) : after]
             if first > 0 and after < len(own) and np.all(group >= 0) and _may_move(problem.system, run, first, after):
                 idle[group[0]] = True
     if parameters:
         base = evaluator.cost(theta)
         for i in _list_parameters(problem):
+            # Two changes, to both sides: the derivative may be zero at theta and the cost not constant.
             moved = map(evaluator.cost, list_changes(problem, theta, i, TESTED_CHANGES))
             idle[i] = all(abs(cost - base) <= LEAST_EFFECT_ON_COST * abs(base) for cost in moved)
     return idle

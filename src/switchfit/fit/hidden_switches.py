@@ -43,6 +43,7 @@ def refuse_hidden_switches(
         What is evaluated beside the gradient: by what a fit has compiled already.
     """
     unknowns = evaluator.problem.unknowns
+    # Exactly 0: a derivative that is merely small is no sign of a switch, and each suspect costs evaluations.
     suspects = np.flatnonzero((gradient == 0.0) & ~unknowns.is_time).tolist()
     if not suspects:
         return
@@ -81,6 +82,7 @@ def _is_hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float, mat
         there = evaluator(moved, matrix=matrix)
         if not np.isfinite(there.cost):
             continue
+        # It has a derivative elsewhere, as where a mode that reads it has collapsed here: a fit can find it.
         if there.gradient[i] != 0.0:
             return False
         differs = differs or abs(there.cost - base) > CHANGED * max(abs(base), abs(there.cost))

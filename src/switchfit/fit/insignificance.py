@@ -61,6 +61,7 @@ def drop_noise_of_times(problem: Problem, result: Result) -> Result:
     is insignificant: for ``|H_ii| T^2 / 2``, and ``(H_ij T)^2 / (2 H_jj)`` for what an unknown j gains. A kink whose
     slopes are as small holds no time.
     """
+    # Elsewhere the Hessian is not judged, or has been refused already.
     if not (result.status.is_strict_minimum or result.status is Status.SADDLE):
         return result
     insignificant, hessian = _compute_insignificance(problem, result), result.hessian

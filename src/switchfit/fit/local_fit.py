@@ -89,6 +89,8 @@ def fit_on_meshes(
     history: list[IterationRecord] = []
     evaluations, multipliers, broken = 0, None, None
     meshes = evaluator
+    # A mesh is frozen while the optimizer works, so that J is one function: finer ones come between its runs, each of
+    # which goes on from where the last has ended.
     for attempt in range(REFINEMENTS + 1):
         last = history[-1] if history else None
         report = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
@@ -102,10 +104,15 @@ def fit_on_meshes(
         history += [record.continue_from(last) for record in result.history[1:]] if history else result.history
         evaluations += result.evaluations
         theta = result.theta
+        # An error that is nothing beside J at the start is no error of a perfect fit, whose J is rounding.
         scale = max(first_cost, history[0].cost if history else 0.0)
         values = [value for _, value, _ in result.equalities]
+        # The Lagrangian on the next mesh begins with the multipliers of this one: at zero it would leave the
+        # constraints first.
         multipliers = [multiplier for _, _, multiplier in result.equalities] or None
         fine, fine_cost, error, output = judge_meshes(evaluator, theta, result.cost, scale, values)
+        # What the optimizer still misses is less than J is accurate to: that is convergence, as far as this mesh can
+        # tell.
         if is_within_error(problem, result, abs(fine_cost - result.cost)):
             result = replace(result, status=Status.CONVERGED_PRECISION)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
@@ -132,6 +139,7 @@ def fit_on_meshes(
     )
     model = {"problem": evaluator.problem, "evaluator": evaluator}
     found = build_fit(SolvedFit, ended, layout_of(problem), solution, search, trajectories=(), comparisons=(), **model)
+    # On the halved rows, which have been evaluated for the integration error: curves are those of the better mesh.
     found.simulate_later(fine)
     return found
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from switchfit.arrays import FloatArray
 from switchfit.engine.evaluation import Matrix
@@ -38,7 +38,7 @@ the horizon."""
 
 def minimize_cost(
     source: Evaluator | Follower,
-    theta: Any,
+    theta: ArrayLike,
     hessian: HessianKind,
     tolerance: float,
     max_iterations: int,
@@ -60,16 +60,19 @@ def minimize_cost(
     problem = evaluator.problem
     names = problem.constraint_names
     unknowns = problem.unknowns
+    # Block-diagonal and descent-first are made of the exact matrix, by labels and by the optimizer.
     matrix: Matrix = hessian if hessian in ("gauss-newton", "none") else "exact"
     many = len(problem.experiments) >= MANY_RUNS and not names
-    by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
+    # The arrow pays where more than half of the unknowns belong to one run alone.
+    by_blocks = many and 2 * len(evaluator.layout.shared) < len(unknowns.names)
     constraints = problem.constraints if constraints is None else constraints
+    # Most problems have no scales: their theta is the optimizer's own, to the last bit.
     change = None if unknowns.variables.identity else ChangeOfVariables.of(evaluator, constraints)
     seen: list[bool] = []
     seen_by: Matrix = "none" if by_blocks else matrix
     arrow = by_blocks and hessian not in ("none", "descent-first")
 
-    def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
+    def evaluate(z: FloatArray, side: int, multipliers: FloatArray | None = None) -> Any:
         theta = z if change is None else change.to_theta(z)
         if multipliers is not None:
             here = source.constrained(theta, side, multipliers)
@@ -87,6 +90,7 @@ def minimize_cost(
     def report(record: IterationRecord) -> object:
         record = record if change is None else change.convert_record(record)
         if follower is not None:
+            # Here and not at each evaluation: a mesh made for a trial point is kept only if the point is.
             follower.accept(record.theta, record.cost)
         return None if callback is None else with_own_threads(callback)(record)
 
@@ -107,6 +111,8 @@ def minimize_cost(
     )
     start = unknowns.variables.inward(np.asarray(theta, dtype=float))
     result = minimize(posed, start, None if follower is None and callback is None else report, multipliers)
+    # Where a measured state jumps, J falls towards one side of a sample and rises behind it: such a time is held
+    # between.
     if any(structure.has_resets for structure in evaluator.structures):
         result = hold_at_jumps(posed, result)
     if change is None:
