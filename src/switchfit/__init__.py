@@ -10,7 +10,13 @@ from switchfit.runtime import load_later as _load_later
 from switchfit.runtime.xla_flags import compile_small_loops_whole as _compile_small_loops_whole
 
 _compile_small_loops_whole()  # now: XLA reads its flags when it first compiles, in whatever part of the program
-_load_later(lambda: _import_module("switchfit.report"))  # which registers how results are printed and drawn
+_REGISTERING = (
+    "report", "estimation.comparison_report", "batch.figures", "batch.frames", "batch.tables", "modes.ending_report",
+    "modes.rates_report", "modes.search_figure", "modes.search_report", "online.report", "experiment_design.report",
+)  # fmt: skip
+"""Modules that register how results are printed and drawn."""
+
+_load_later(lambda: [_import_module(f"switchfit.{name}") for name in _REGISTERING])
 
 __version__ = "0.1.0"
 

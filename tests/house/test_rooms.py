@@ -11,7 +11,7 @@ PACKAGE = Path(sf.__file__).parent
 
 LAYERS = (
     "arrays", "runtime", "optimize", "problem", "models", "discretization", "engine", "paper_adjoint", "meshes", "fit",
-    "uncertainty", "strategy", "io", "estimation", "batch", "modes", "online", "experiment_design", "report", "paper",
+    "uncertainty", "strategy", "io", "report", "estimation", "batch", "modes", "online", "experiment_design", "paper",
     "cli", "__main__",
 )  # fmt: skip
 """From the bottom to the top; the package itself, which collects what is public, is above them all."""

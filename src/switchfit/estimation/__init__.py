@@ -1,4 +1,4 @@
 """`Estimate`, the facade of a fit with its methods, which `estimate` returns, and the comparison of several.
 
-Imports `strategy` and the rooms before it; no room below imports it.
+Imports `report` and the rooms before it; no room below imports it.
 """

@@ -1,27 +1,18 @@
-"""Results for people: text, tables and figures.
+"""Reports of one fit for people: text, tables, figures, the HTML page; and what all reports are made of.
 
-Results do not know this room. Its modules register how each kind of result is written and drawn
-(`switchfit.runtime.presentation`). All of them are imported together, when a result is first written or drawn.
-Imports `experiment_design` and the rooms before it.
+Modules here register how a result of the rooms below is written and drawn (`switchfit.runtime.presentation`); rooms
+above do so for their own results, in modules beside these. All of them are imported together, when a result is first
+written or drawn. Imports `io` and the rooms before it.
 """
 
 from switchfit.report import (  # noqa: F401
     certificate,
     directions,
-    experiment_design,
     fit_report,
-    fits_figures,
-    fits_tables,
     frames,
     gallery,
     html,
-    insertion_rates,
     issues,
-    mode_endings,
-    mode_figure,
-    mode_search,
-    model_comparison,
-    online,
     prediction,
     problem,
     profiles,

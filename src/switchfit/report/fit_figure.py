@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.result import Fit
 from switchfit.problem.validation.arrays import as_level
 from switchfit.problem.validation.objects import as_flag
@@ -27,6 +26,7 @@ from switchfit.report.style import TRANSITION_COLOUR
 from switchfit.runtime.presentation import Axes, Figure
 from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.corrected_errors import find_transition_intervals
+from switchfit.uncertainty.judged_fit import JudgedFit
 from switchfit.uncertainty.prediction import Prediction, predict
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ RUNS_SIDE_BY_SIDE, INCHES_OF_EACH_RUN = 4, (0.0, 8.0, 5.5, 4.5, 4.0)
 """Experiments side by side; inches of each of so many."""
 
 
-def has_bands(fit: Any) -> TypeGuard[Estimate]:
+def has_bands(fit: Any) -> TypeGuard[JudgedFit]:
     """Return whether there are a model and a covariance, and room for the derivatives that bands need.
 
     Parameters

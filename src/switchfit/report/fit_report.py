@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from switchfit.estimation.estimates import Estimate
 from switchfit.report import tables
 from switchfit.report.directions import write_direction
 from switchfit.report.fit_summary import format_rows, list_course, list_experiments, list_quality, tabulate_channels
@@ -15,6 +14,7 @@ from switchfit.report.unknowns import SMALL_CORRELATION, format_unknowns, tabula
 from switchfit.runtime.presentation import format_count, format_text
 from switchfit.uncertainty.identification import WEAK
 from switchfit.uncertainty.issues import find_issues
+from switchfit.uncertainty.judged_fit import JudgedFit
 
 _COVERED = {
     "a mode collapsed": {"idle times", "idle parameters"},
@@ -31,13 +31,13 @@ _COVERED = {
 """Other kinds of warnings whose content is in a reason of the verdict, by the kind of that reason."""
 
 
-@format_text.register(Estimate)
-def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
+@format_text.register(JudgedFit)
+def write_estimate(estimate: JudgedFit, *, full: bool = False) -> str:
     """Return the report: the verdict, the problem, the course of the fit, its quality, the unknowns, the warnings.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
         The failures of its certificate count in the verdict if it is known.
     full : bool
         All experiments, channels, unknowns, correlations, directions and warnings; otherwise as much as fits on one
@@ -67,7 +67,7 @@ def write_estimate(estimate: Estimate, *, full: bool = False) -> str:
     return shown if full else f"{shown}\n\nMore: estimate.report(full=True), switchfit fit --full."
 
 
-def _describe_weak(estimate: Estimate, most: int) -> list[str]:
+def _describe_weak(estimate: JudgedFit, most: int) -> list[str]:
     """Return the combinations of unknowns that the data hardly determine, as lines."""
     found = estimate.identifiability
     # Without convergence the curvature is not that of a minimum, and what it says of directions means little.
@@ -82,7 +82,7 @@ def _list_sentences(sentences: Sequence[str], most: int, what: str) -> list[str]
     return lines + ([f"  and {format_count(more, what)} more"] if more else [])
 
 
-def _list_warnings(estimate: Estimate) -> list[str]:
+def _list_warnings(estimate: JudgedFit) -> list[str]:
     """Return the warnings that the verdict does not cover, as sentences."""
     reasons = {reason.kind for reason in estimate.verdict.reasons}
     # Of two sentences on one thing, the verdict's is enough: it says what to do.

@@ -9,10 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.batch.bootstrap_study import Bootstrap
-from switchfit.batch.fits import Fits
-from switchfit.batch.starts import Multistart
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.time_units import SECONDS_OF_UNIT, normalize_time_unit
@@ -21,6 +17,7 @@ from switchfit.report.times import format_iso, list_dated
 from switchfit.report.unknowns import list_holds
 from switchfit.runtime.frames import Column, Frame, describe_frame
 from switchfit.uncertainty.corrected_errors import correct_errors, correct_intervals
+from switchfit.uncertainty.judged_fit import JudgedFit
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.profiles import Profile
 from switchfit.uncertainty.residuals import list_channels
@@ -29,13 +26,13 @@ ERROR, LOW, HIGH = "{} std. error", "{} low", "{} high"
 """Names of the columns beside an unknown: its standard error, and the ends of its 95 % interval."""
 
 
-@describe_frame.register(Estimate)
-def describe_estimate(estimate: Estimate, *, what: str = "unknowns") -> Frame:
+@describe_frame.register(JudgedFit)
+def describe_estimate(estimate: JudgedFit, *, what: str = "unknowns") -> Frame:
     """Return one of the tables of an estimate.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     what : {"unknowns", "trajectories", "residuals", "history"}
     """
     tables = {
@@ -47,7 +44,7 @@ def describe_estimate(estimate: Estimate, *, what: str = "unknowns") -> Frame:
     return tables[what](estimate)
 
 
-def _describe_unknowns(estimate: Estimate) -> Frame:
+def _describe_unknowns(estimate: JudgedFit) -> Frame:
     """Return a row for each unknown; standard errors and intervals allow for correlated residuals, as in the report."""
     names, naive, dated = estimate.theta_names, estimate.standard_errors, list_dated(estimate)
     low, high = correct_intervals(estimate).T
@@ -80,7 +77,7 @@ def _list_columns(columns: Mapping[str, Any]) -> tuple[Column, ...]:
     return tuple(Column(name, np.asarray(values)) for name, values in columns.items())
 
 
-def _split(values: FloatArray, names: Sequence[str], units: Sequence[str], label: str = "{}") -> list[Column]:
+def split_columns(values: FloatArray, names: Sequence[str], units: Sequence[str], label: str = "{}") -> list[Column]:
     """Return the columns of values (K, n), whose names are put into a label."""
     named = zip(names, units, values.T, strict=True)
     return [Column(label.format(name), column, format_unit(unit)) for name, unit, column in named]
@@ -94,7 +91,7 @@ def _describe_trajectories(fit: Fit) -> Frame:
         np.concatenate([getattr(trajectory, name) for trajectory in each]) for name in ("times", "modes", "states")
     )
     index = Column("run", runs), Column("time", times, _get_time_unit(fit))
-    return Frame(index, (Column("mode", modes), *_split(states, each[0].state_names, each[0].state_units)))
+    return Frame(index, (Column("mode", modes), *split_columns(states, each[0].state_names, each[0].state_units)))
 
 
 def _get_time_unit(fit: Fit) -> str:
@@ -103,7 +100,7 @@ def _get_time_unit(fit: Fit) -> str:
     return units.pop() if len(units) == 1 else ""
 
 
-def _describe_residuals(estimate: Estimate) -> Frame:
+def _describe_residuals(estimate: JudgedFit) -> Frame:
     """Return a row for each value that was measured, in the order of runs, data and channels."""
     parts: list[dict[str, NDArray[Any]]] = []
     for _, e, comparison, k in list_channels(estimate.comparisons, estimate.run_names):
@@ -136,7 +133,7 @@ def _describe_history(fit: Fit) -> Frame:
     index, *others = _list_columns(columns)
     # A history may be empty: its table then has no rows, but the same columns.
     theta = np.array([record.theta for record in fit.history]).reshape(-1, len(fit.theta_names))
-    return Frame((index,), (*others, *_split(theta, fit.theta_names, fit.theta_units)))
+    return Frame((index,), (*others, *split_columns(theta, fit.theta_names, fit.theta_units)))
 
 
 def _list_dates(result: Trajectory | Prediction) -> list[Column]:
@@ -158,7 +155,7 @@ def describe_trajectory(trajectory: Trajectory) -> Frame:
     ----------
     trajectory : Trajectory
     """
-    states = _split(trajectory.states, trajectory.state_names, trajectory.state_units)
+    states = split_columns(trajectory.states, trajectory.state_names, trajectory.state_units)
     columns = (*_list_dates(trajectory), Column("mode", trajectory.modes), *states)
     return Frame((Column("time", trajectory.times, trajectory.time_unit),), columns)
 
@@ -176,9 +173,9 @@ def describe_prediction(prediction: Prediction) -> Frame:
     outputs = {"{}": prediction.outputs, ERROR: prediction.output_errors, LOW: output_band[0], HIGH: output_band[1]}
     columns, names = _list_dates(prediction), prediction.output_names
     for label, values in states.items():
-        columns += _split(values, prediction.state_names, prediction.state_units, label)
+        columns += split_columns(values, prediction.state_names, prediction.state_units, label)
     for label, values in (outputs | {"{} noise": prediction.noise}).items():
-        columns += _split(values, names, [""] * len(names), label.format("{} output"))
+        columns += split_columns(values, names, [""] * len(names), label.format("{} output"))
     return Frame((Column("time", prediction.times, prediction.time_unit),), tuple(columns))
 
 
@@ -193,33 +190,8 @@ def describe_profile(profile: Profile) -> Frame:
     fit = profile.fit
     low, high = map(float, profile.interval())
     measured = {"cost": profile.costs, "zeta": profile.zeta, "converged": profile.converged}
-    columns = (*_list_columns(measured), *_split(profile.thetas, fit.theta_names, fit.theta_units))
+    columns = (*_list_columns(measured), *split_columns(profile.thetas, fit.theta_names, fit.theta_units))
     others = tuple(column for column in columns if column.name != profile.name)
     attributes = {"estimate": profile.value, "std_error": profile.standard_error, "level": profile.level}
     attributes |= {"low": low, "high": high, "widening": profile.widening}
     return Frame((Column(profile.name, profile.values, format_unit(profile.unit)),), others, attributes)
-
-
-@describe_frame.register(Fits)
-def describe_fits(fits: Fits) -> Frame:
-    """Return a row for each fit.
-
-    Parameters
-    ----------
-    fits : Fits
-    """
-    low, high = np.moveaxis(fits.confidence_intervals(), -1, 0)
-    errors = np.where(fits.standard_errors > 0, fits.standard_errors, np.nan)
-    columns = [Column("level", fits.levels), Column("status", fits.status)]
-    if isinstance(fits, Multistart):
-        columns.append(Column("cluster", fits.clusters))
-    own = {"{}": fits.theta, ERROR: errors, LOW: low, HIGH: high, "{} start": fits.start}
-    for label, values in own.items():
-        columns += _split(values, fits.theta_names, fits.theta_units, label)
-    names = ("cost", "explained", "samples", "optimality", "iterations", "evaluations", "collapsed", "at_bounds")
-    columns += [Column(name, getattr(fits, name)) for name in (*names, "message")]
-    # What is true of the study as a whole; `requested` is more than the rows where it was stopped.
-    attributes: dict[str, str | float] = {"requested": fits.requested, "seconds": float(fits.seconds)}
-    if isinstance(fits, Bootstrap):
-        attributes["resample"] = fits.resample
-    return Frame((Column("run", fits.runs),), tuple(columns), attributes)

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.comparison import Comparison
 from switchfit.problem.validation.arrays import as_index
 from switchfit.problem.validation.messages import join_names, shorten
@@ -16,6 +15,7 @@ from switchfit.report.numbers import label_quantity
 from switchfit.report.panels import choose_mode_colours, draw_measured
 from switchfit.report.style import DATA_COLOUR, LINE
 from switchfit.runtime.presentation import Axes, Figure
+from switchfit.uncertainty.judged_fit import JudgedFit
 
 LENGTH_UNITS = {"", "1", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
 PAIRS = ({"x": "y"}, {"east": "north"}, {"e": "n"}, {"easting": "northing"}, {"lon": "lat"}, {"longitude": "latitude"})
@@ -43,13 +43,13 @@ def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | 
 
 
 def plot_plane(
-    estimate: Estimate, *, channels: tuple[str, str] | None = None, experiment: int = 0, ax: Axes | None = None
+    estimate: JudgedFit, *, channels: tuple[str, str] | None = None, experiment: int = 0, ax: Axes | None = None
 ) -> Axes | Figure:
     """Draw two measured positions against one another: samples, fitted path with its modes.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     channels : (str, str), optional
         Names of the two channels; left out, they are told by names such as X and Y or east and north.
     experiment : int, optional
@@ -86,7 +86,7 @@ def plot_plane(
     return style.turn_off_formulas(drawn)
 
 
-def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) -> tuple[Comparison, list[int]]:
+def _choose_plane(estimate: JudgedFit, e: int, channels: tuple[str, ...] | None) -> tuple[Comparison, list[int]]:
     """Return the data with the two channels that are named, or that are positions by their names, and their places."""
     for comparison in estimate.comparisons[e]:
         if channels is not None and set(channels) <= set(comparison.names):

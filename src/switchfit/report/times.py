@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.batch.fits import Fits
 from switchfit.fit.result import Fit
 from switchfit.problem.origin import Origin
 from switchfit.problem.problem import Problem
@@ -132,11 +131,8 @@ def label_time(run: Timed, name: str = "time") -> str:
     return label_quantity(name, run.time_unit if run.origin is None else run.origin.time_zone)
 
 
-def list_dated(result: Fit | Problem | Fits) -> list[Timed | None]:
+def list_dated(result: Fit | Problem) -> list[Timed | None]:
     """Return what has each unknown that is a time with dates as a time: its run; None for every other unknown."""
-    if isinstance(result, Fits):
-        origins = zip(result.date_origins, result.theta_units, strict=True)
-        return [None if origin is None else Clock(origin, unit) for origin, unit in origins]
     if isinstance(result, Problem):
         pairs: Iterable[tuple[Timed, Any]] = zip(result.experiments, result.unknowns.times, strict=True)
     else:

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.result import Fit
 from switchfit.report import selection, times
 from switchfit.report.numbers import format_rounded, format_unit
@@ -16,6 +15,7 @@ from switchfit.report.times import Timed, format_time
 from switchfit.report.wording import ALLOWED
 from switchfit.runtime.presentation import join_first
 from switchfit.uncertainty.corrected_errors import correct_errors, correct_intervals
+from switchfit.uncertainty.judged_fit import JudgedFit
 
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which the report calls it asymmetric."""
@@ -98,7 +98,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent." if known else ""
     # A robust loss is not the log-likelihood of any noise that is known: standard errors take it for one.
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
-    has_sandwich = isinstance(fit, Estimate) and fit.has_sandwich
+    has_sandwich = isinstance(fit, JudgedFit) and fit.has_sandwich
     other = ": covariance_from('sandwich') does not." if has_sandwich else "."
     matrix = "the Gauss-Newton matrix" if fit.hessian_kind == "sharp" else "the exact Hessian"
     return table, f"Standard errors from {matrix}.{ROBUST + other if robust else ''}"

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.comparison import Comparison, find_delay
 from switchfit.fit.result import Fit
 from switchfit.report.fit_figure import has_bands
@@ -25,6 +24,7 @@ from switchfit.report.plane import find_plane
 from switchfit.report.times import format_estimate
 from switchfit.report.unknowns import format_end
 from switchfit.uncertainty.corrected_errors import correct_errors, find_transition_intervals
+from switchfit.uncertainty.judged_fit import JudgedFit
 from switchfit.uncertainty.prediction import predict
 from switchfit.uncertainty.sensitivity import Points
 
@@ -67,14 +67,14 @@ class Curves:
     left_out: int = 0
 
 
-def list_places(estimate: Estimate, e: int) -> list[int]:
+def list_places(estimate: JudgedFit, e: int) -> list[int]:
     """Return the places in theta of the unknowns that move the curves of a run; nothing where the model is not there.
 
     Delays move their curve in time, and are left out.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     e : int
     """
     if estimate.problem is None:
@@ -85,12 +85,12 @@ def list_places(estimate: Estimate, e: int) -> list[int]:
     return [place for place in sorted(set(places[places >= 0].tolist())) if estimate.theta_names[place] not in delays]
 
 
-def choose_points(estimate: Estimate, runs: Sequence[int], unknowns: int) -> int:
+def choose_points(estimate: JudgedFit, runs: Sequence[int], unknowns: int) -> int:
     """Return how many points a curve may have, so that all of them stay in the `BUDGET`.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     runs : sequence of int
         Which are shown.
     unknowns : int
@@ -101,12 +101,12 @@ def choose_points(estimate: Estimate, runs: Sequence[int], unknowns: int) -> int
     return int(np.clip(BUDGET / max(channels * (unknowns + 4), 1), FEWEST_POINTS_OF_CURVE, MOST_POINTS_OF_CURVE))
 
 
-def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: int) -> list[Curves]:
+def collect_curves(estimate: JudgedFit, e: int, places: Sequence[int], points: int) -> list[Curves]:
     """Return the curves of one run: an entry for each of its data, then the states that are not measured by name.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     e : int
         Which run, from 0.
     places : sequence of int
@@ -186,7 +186,7 @@ def _list_samples(
 
 
 def _stack_outputs_and_states(
-    estimate: Estimate, e: int, nodes: Points | None
+    estimate: JudgedFit, e: int, nodes: Points | None
 ) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
     """Return all outputs and then all states of a run, their derivatives in theta, and their bands.
 

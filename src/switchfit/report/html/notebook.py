@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sized
 from html import escape
 from typing import Literal
 
-from switchfit.batch.fits import Fits
 from switchfit.problem.problem import Problem
 from switchfit.report.html import notebook
 from switchfit.runtime.presentation import Displayed, Figure, format_html, format_text
@@ -33,7 +33,7 @@ def show_result(result: object) -> str:
     is_forecast = isinstance(result, Prediction)
     # Panels that the figure would have.
     size = len(getattr(result, "output_names" if is_forecast else "trajectories", ()))
-    is_empty = (is_forecast and not size) or (isinstance(result, Fits) and not len(result))
+    is_empty = (is_forecast and not size) or (isinstance(result, Sized) and not len(result))
     image = ""
     if hasattr(result, "plot") and not is_empty and size <= MOST_PANELS_IN_NOTEBOOK:
         source = notebook.embed_figure(result.plot(), dpi=SMALL_FIGURE_DPI)

@@ -15,7 +15,6 @@ from bokeh.embed import json_item
 from bokeh.resources import Resources
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
 from switchfit.fit.result import Fit
 from switchfit.io.provenance import Provenance
 from switchfit.problem.validation.messages import unit_suffix
@@ -43,6 +42,7 @@ from switchfit.report.wording import join_words
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.explained_variance import explain_worst, rank_runs
 from switchfit.uncertainty.issues import find_issues
+from switchfit.uncertainty.judged_fit import JudgedFit
 
 MOST_RUNS_IN_PAGE = 12
 """Experiments whose figures are in a page, those that are explained worst."""
@@ -60,12 +60,12 @@ MOST_CORRELATED = 60
 """Unknowns in the heat map, the first ones; the largest correlations of all are listed beside it."""
 
 
-def build_page(estimate: Estimate, origin: Provenance) -> str:
+def build_page(estimate: JudgedFit, origin: Provenance) -> str:
     """Return the report of an estimate as one HTML page.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     origin : Provenance
         What the fit was made from.
     """
@@ -95,7 +95,7 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     return environment.get_template("report.html").render(content)
 
 
-def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def _prepare_figures(estimate: JudgedFit) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the runs that are shown, the one that is explained worst first, and the JSON of their figures."""
     # The worst explained first: of many runs, those are in the page that deserve a look.
     order = rank_runs(estimate)[:MOST_RUNS_IN_PAGE]

@@ -6,19 +6,19 @@ with the extra ``report``. They and `page`, which builds the file, are imported 
 
 from __future__ import annotations
 
-from switchfit.estimation.estimates import Estimate
 from switchfit.io.provenance import Provenance
 from switchfit.runtime.extras import import_library
 from switchfit.runtime.presentation import format_page
+from switchfit.uncertainty.judged_fit import JudgedFit
 
 
-@format_page.register(Estimate)
-def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> str:
+@format_page.register(JudgedFit)
+def write_page(estimate: JudgedFit, *, provenance: Provenance | None = None) -> str:
     """Return the report of an estimate as one HTML page.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     provenance : Provenance, optional
         What the fit was made from; left out, what the estimate knows of it.
 

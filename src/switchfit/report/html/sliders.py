@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.arrays import FloatArray
-from switchfit.estimation.estimates import Estimate
 from switchfit.report.html.curves import Curves
 from switchfit.report.numbers import format_unit
 from switchfit.report.times import describe_clock, list_dated
+from switchfit.uncertainty.judged_fit import JudgedFit
 
 SIDE_POINTS = 20
 """Values of J to each side of the estimate."""
@@ -26,7 +26,7 @@ VISIBLE = 0.15
 """Part of a channel's range by which the end of a slider moves the curve, if the bounds allow it."""
 
 
-def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[dict[str, Any]]:
+def build_sliders(estimate: JudgedFit, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[dict[str, Any]]:
     """Return what the page knows of a slider, for each unknown that has room to move.
 
     Its place in theta, its name, unit and value, how it is shown as a date, the `values` and J along it, the others
@@ -34,7 +34,7 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
         With its problem.
     runs : mapping of run to its curves
         Those that are shown.
@@ -62,12 +62,12 @@ def drop_nan(values: ArrayLike) -> object:
     return np.where(np.isfinite(values), values, np.array(None)).tolist()
 
 
-def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) -> tuple[float, float]:
+def find_range(estimate: JudgedFit, runs: dict[int, list[Curves]], place: int) -> tuple[float, float]:
     """Return how far an unknown can be moved: until a curve has moved visibly, inside its bounds, in its order.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     runs : mapping of run to its curves
     place : int
     """
@@ -91,12 +91,12 @@ def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) ->
     return low, high
 
 
-def evaluate_moved(estimate: Estimate, place: int, value: float) -> float:
+def evaluate_moved(estimate: JudgedFit, place: int, value: float) -> float:
     """Return J with one unknown moved, by evaluating the runs that depend on it.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : JudgedFit
     place : int
     value : float
     """

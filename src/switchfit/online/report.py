@@ -7,12 +7,12 @@ from collections import Counter
 import numpy as np
 
 from switchfit.arrays import FloatArray
+from switchfit.modes.search_figure import stack_probabilities
+from switchfit.modes.search_report import tabulate_segments
 from switchfit.online.log import OnlineLog
 from switchfit.problem.validation.messages import unit_suffix
 from switchfit.report import numbers, panels, style, tables
 from switchfit.report import times as times_module
-from switchfit.report.mode_figure import stack_probabilities
-from switchfit.report.mode_search import tabulate_segments
 from switchfit.report.style import FIT_COLOUR, LINE, SHADE_COLOUR, SMALL, THIN, TRANSITION_COLOUR
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.report.times import format_estimate, format_time, label_time

@@ -16,7 +16,7 @@ from switchfit.problem.validation.messages import unit_suffix
 from switchfit.report import selection, tables
 from switchfit.report.numbers import label_quantity
 from switchfit.report.tables import Table, format_table
-from switchfit.report.times import format_estimate, format_time, list_dated
+from switchfit.report.times import Clock, Timed, format_estimate, format_time
 from switchfit.runtime.presentation import format_count, format_text
 
 LISTED_COST_MINIMA = 10
@@ -31,6 +31,12 @@ LISTED_COLUMNS = 4
 """Unknowns in the line of a fit."""
 
 TOO_FEW = "Fewer than two fits converged: no statistics."
+
+
+def list_dated_unknowns(fits: Fits) -> list[Timed | None]:
+    """Return the clock of each unknown that is a time with dates; None for every other unknown."""
+    origins = zip(fits.date_origins, fits.theta_units, strict=True)
+    return [None if origin is None else Clock(origin, unit) for origin, unit in origins]
 
 
 @format_text.register(Fits)
@@ -82,7 +88,11 @@ def tabulate_study(fits: Fits) -> tuple[Table, str]:
     if len(fits) > LISTED_FITS:
         listed = fits.worst_first[:LISTED_WORST].tolist()
         notes.append(f"the worst {LISTED_WORST} of {len(fits)} fits; .to_pandas() has all of them")
-    shown, errors, clocks = select_unknowns_of_fits(fits, LISTED_COLUMNS), fits.standard_errors, list_dated(fits)
+    shown, errors, clocks = (
+        select_unknowns_of_fits(fits, LISTED_COLUMNS),
+        fits.standard_errors,
+        list_dated_unknowns(fits),
+    )
     titles, rows = ["run", "", "J", *(part for i in shown for part in (_label(fits, i), ""))], []
     for k in listed:
         cells = [part for i in shown for part in format_estimate(fits.theta[k, i], errors[k, i], clocks[i])]
@@ -94,7 +104,7 @@ def tabulate_study(fits: Fits) -> tuple[Table, str]:
 @tabulate_study.register
 def tabulate_minima(study: Multistart) -> tuple[Table, str]:
     """Return a row for each of the ten lowest minima: J, how many starts ended there, and where it is."""
-    rows, clocks = [], list_dated(study)
+    rows, clocks = [], list_dated_unknowns(study)
     shown = select_unknowns_of_fits(study, LISTED_PLACES)
     for k in range(min(count_minima(study), LISTED_COST_MINIMA)):
         # Clusters are numbered by their cost, the lowest first; its first start stands for where it is.
@@ -131,7 +141,7 @@ def tabulate_monte_carlo(study: MonteCarlo) -> tuple[Table, str]:
     spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
     # The middle of the standard errors that the fits report, to be compared with the spread of their estimates.
     reported = np.median(study.standard_errors[study.success], axis=0)
-    rows, shown, clocks = [], select_unknowns_of_fits(study, LISTED_UNKNOWNS), list_dated(study)
+    rows, shown, clocks = [], select_unknowns_of_fits(study, LISTED_UNKNOWNS), list_dated_unknowns(study)
     for i in shown:
         truth = format_time(study.truth[i], clocks[i], spread[i])
         error = "-" if np.isnan(reported[i]) else f"{reported[i]:.3e}"
@@ -147,7 +157,7 @@ def tabulate_bootstrap(study: Bootstrap) -> tuple[Table, str]:
     """Return a row for each unknown: estimate, bias, bootstrap standard error, 95 % interval (BCa)."""
     if int(study.success.sum()) < 2:
         return Table([], ""), TOO_FEW
-    rows, shown, clocks = [], select_unknowns_of_fits(study, LISTED_UNKNOWNS), list_dated(study)
+    rows, shown, clocks = [], select_unknowns_of_fits(study, LISTED_UNKNOWNS), list_dated_unknowns(study)
     bias, error, intervals = study.bias, study.standard_deviation, study.intervals()
     for k in shown:
         ends = ", ".join(format_time(end, clocks[k], error[k]) for end in intervals[k])

@@ -12,10 +12,9 @@ from switchfit.batch.bootstrap_study import Bootstrap
 from switchfit.batch.fits import Fits
 from switchfit.batch.monte_carlo_study import MonteCarlo
 from switchfit.batch.starts import Multistart
+from switchfit.batch.tables import TOO_FEW, count_minima, list_dated_unknowns, select_unknowns_of_fits
 from switchfit.report import selection, style
-from switchfit.report.fits_tables import TOO_FEW, count_minima, select_unknowns_of_fits
 from switchfit.report.style import DATA_COLOUR, FIT_COLOUR, GROUP_COLOURS, LINE, SHADE_COLOUR, SMALL, THIN
-from switchfit.report.times import list_dated
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count
 
 OTHERS = "#bbbbbb"
@@ -132,7 +131,7 @@ def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bo
 
 def _label_axis(fits: Fits, k: int, ax: Axes) -> None:
     """Label the horizontal axis with the name and unit of unknown k, with few ticks, at dates if it is a date."""
-    clock = list_dated(fits)[k]
+    clock = list_dated_unknowns(fits)[k]
     style.label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
     if clock is None:
         ax.locator_params(axis="x", nbins=4)

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from switchfit.arrays import FloatArray
+from switchfit.modes.ending_report import CRITERION_TITLES
 from switchfit.modes.result import ModeSearch
+from switchfit.modes.search_report import list_criteria
 from switchfit.report import panels, style
-from switchfit.report.mode_endings import CRITERION_TITLES
-from switchfit.report.mode_search import list_criteria
 from switchfit.report.style import FIT_COLOUR, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE_COLOUR, SMALL, THIN
 from switchfit.runtime.presentation import Axes, Figure, draw_figure
 

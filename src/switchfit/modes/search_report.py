@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from switchfit.arrays import FloatArray
+from switchfit.modes.ending_report import CRITERION_TITLES, name_criterion
 from switchfit.modes.result import ModeFit, ModeSearch
 from switchfit.report import numbers, tables
 from switchfit.report import times as times_module
-from switchfit.report.mode_endings import CRITERION_TITLES, name_criterion
 from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.report.times import Timed, format_estimate, format_time, label_time
 from switchfit.report.wording import ALLOWED
