@@ -9,7 +9,6 @@ from html import escape
 from typing import Literal
 
 from switchfit.problem.problem import Problem
-from switchfit.report.html import notebook
 from switchfit.runtime.presentation import Displayed, Figure, format_html, format_text
 from switchfit.uncertainty.prediction import Prediction
 
@@ -36,7 +35,7 @@ def show_result(result: object) -> str:
     is_empty = (is_forecast and not size) or (isinstance(result, Sized) and not len(result))
     image = ""
     if hasattr(result, "plot") and not is_empty and size <= MOST_PANELS_IN_NOTEBOOK:
-        source = notebook.embed_figure(result.plot(), dpi=SMALL_FIGURE_DPI)
+        source = embed_figure(result.plot(), dpi=SMALL_FIGURE_DPI)
         image = f'<img alt="the figure of the result" style="background: white" src="{source}">'
     text = repr(result) if is_forecast else format_text(result)
     return f"<div><pre>{escape(text)}</pre>{image}</div>"
